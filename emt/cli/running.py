@@ -1,0 +1,198 @@
+"""`emt run`, `emt reproduce`, `emt table`, `emt replay`."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emt.cli.errors import Interrupted, Unusable, say
+
+
+class TableFormat(StrEnum):
+    """Formats of a table."""
+
+    text = "text"
+    markdown = "markdown"
+    latex = "latex"
+    csv = "csv"
+    json = "json"
+
+
+class Scale(StrEnum):
+    """How many runs."""
+
+    smoke = "smoke"
+    paper = "paper"
+
+
+Config = Annotated[str, typer.Argument(help="A file, or the name of a shipped experiment (see `emt list`).")]
+Overrides = Annotated[
+    list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change, e.g. filters.vb.iterations=3.")
+]
+Data = Annotated[
+    list[Path] | None, typer.Option("--data", help="A recording, or a folder of recordings, found by its hash.")
+]
+
+
+def run(
+    config: Config,
+    overrides: Overrides = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default results/NAME.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, instead of the configuration's.")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Runs in all, instead of the configuration's.")] = None,
+    more: Annotated[int, typer.Option(min=0, help="Runs to add to a finished folder.")] = 0,
+) -> None:
+    """Run an experiment, or continue it where it stopped; ends with its table.
+
+    The folder keeps every finished chunk of runs: after an interruption the same command continues, and
+    --more extends what is there. Another configuration needs another folder.
+
+    Example: emt run tuncer2021/trajectory_uniform monte_carlo.runs=200 filters.vb.iterations=5 --out results/vb5
+    """
+    from emt.config.load import load_experiment
+    from emt.reports.published import summary_table
+
+    changes = list(overrides or [])
+    changes += [f"monte_carlo.seed={seed}"] * (seed is not None) + [f"monte_carlo.runs={runs}"] * (runs is not None)
+    loaded = load_experiment(config, changes)
+    folder = Path("results") / loaded.name if out is None else out
+    summary = run_shown(loaded, folder, more=more)
+    unit = loaded.experiment.length_unit
+    if summary["metrics"]:
+        typer.echo(summary_table(summary, unit).render("text"), nl=False)
+    else:
+        from emt.reports.estimates import estimates_table
+        from emt.store import read_folder
+
+        typer.echo(estimates_table(read_folder(folder), frames=(1, 2, 5, 10, 20, 50, 100, 200, 500)).render("text"))
+    say(f"results: {folder}")
+
+
+def run_shown(loaded, folder: Path, *, more: int = 0, runs: int | None = None):
+    """Runs an experiment under a live view; an interruption becomes a message that says how to go on."""
+    from emt.cli.display import LiveView
+    from emt.runner import run as run_experiment
+
+    metric = loaded.experiment.metrics[0] if loaded.experiment.metrics else ""
+    last = None
+    try:
+        with LiveView(loaded.name, metric) as view:
+
+            def update(progress):
+                nonlocal last
+                last = progress
+                view.update(progress)
+
+            return run_experiment(loaded, folder, runs=runs, more=more, on_progress=update)
+    except KeyboardInterrupt:
+        kept = f"{last.done} of {last.total}" if last is not None else "all finished"
+        raise Interrupted(f"interrupted: {kept} runs are kept in {folder}; the same command continues") from None
+
+
+def reproduce(
+    papers: Annotated[list[str] | None, typer.Argument(metavar="[PAPER]...", help="Papers; all by default.")] = None,
+    scale: Annotated[Scale, typer.Option(help="Number of runs: the paper's table, or a quick look.")] = Scale.paper,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default results/reproduce-SCALE.")] = None,
+    data: Data = None,
+    tables: Annotated[Path | None, typer.Option(help="Also write reports with figures into this folder.")] = None,
+) -> None:
+    """Run every experiment of the papers and show published beside reproduced numbers.
+
+    Experiments on recordings are skipped, with a word, unless --data leads to their file.
+
+    Example: emt reproduce tuncer2021 --scale smoke
+    """
+    from emt.config.load import load_experiment
+    from emt.config.shipped import config_names, papers as shipped_papers
+    from emt.registry import suggest
+    from emt.reports.paper import paper_report
+
+    wanted = papers or shipped_papers()
+    for paper in wanted:
+        if paper not in shipped_papers():
+            near = suggest(paper, shipped_papers())
+            hint = f" (did you mean '{near}'?)" if near else ""
+            raise Unusable(f"unknown paper '{paper}'{hint}; known: {', '.join(shipped_papers())}")
+    out = Path("results") / f"reproduce-{scale}" if out is None else out
+    loaded = [load_experiment(name) for paper in wanted for name in config_names(paper)]
+    recordings = find_recordings(loaded, data or [])
+    for paper in wanted:
+        folders = {}
+        for item in (one for one in loaded if one.name.split("/")[0] == paper):
+            if item.experiment.scenario.kind == "recorded" and item.experiment.scenario.path is None:
+                if item.name not in recordings:
+                    say(f"{item.name}: skipped, it needs its recording: --data PATH")
+                    continue
+                item = load_experiment(item.name, [f"scenario.path={recordings[item.name]}"])
+            runs = item.experiment.monte_carlo.smoke_runs if scale == Scale.smoke else None
+            folders[item.name] = out / item.name
+            run_shown(item, folders[item.name], runs=runs)
+        report = paper_report(paper, folders)
+        for part in report.tables:
+            typer.echo(part.render("text"))
+        path = report.write(out / paper)
+        say(f"report: {path}")
+        if tables is not None:
+            say(f"report: {report.write(tables, prefix=f'{paper}-', name=f'{paper}.md')}")
+
+
+def find_recordings(loaded, places: list[Path]) -> dict[str, Path]:
+    """The file of every recorded experiment that is found, by its hash, at or under the given places."""
+    import hashlib
+
+    wanted = {
+        item.experiment.scenario.sha256: item.name for item in loaded if item.experiment.scenario.kind == "recorded"
+    }
+    found = {}
+    for place in places:
+        if not place.exists():
+            raise Unusable(f"--data {place}: there is no such file or folder")
+        for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
+            if path.is_file() and path.suffix.lower() in (".mat", ".csv"):
+                digest = hashlib.sha256(path.read_bytes()).hexdigest()
+                if digest in wanted:
+                    found[wanted[digest]] = path.resolve()
+    return found
+
+
+def table(
+    folder: Annotated[Path, typer.Argument(help="A folder written by `emt run` or `emt reproduce`.")],
+    format: Annotated[TableFormat, typer.Option("--format", "-f", help="Format.")] = TableFormat.text,
+) -> None:
+    """Print the table of a finished experiment; with published numbers beside it where there are any.
+
+    Example: emt table results/tuncer2021/trajectory_uniform --format latex
+    """
+    from emt.reports.paper import folder_tables
+
+    for part in folder_tables(folder):
+        typer.echo(part.render(format.value), nl=format.value in ("text", "markdown"))
+
+
+def replay(
+    config: Config,
+    overrides: Overrides = None,
+    run: Annotated[int, typer.Option("--run", min=0, help="Number of the run.")] = 0,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, instead of the configuration's.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for figure and values; default results/replay.")] = None,
+) -> None:
+    """Compute one run again: a figure of truth, scans and every filter's ellipses, and every step's values.
+
+    Example: emt replay tuncer2021/trajectory_uniform --run 17
+    """
+    from emt.config.load import load_experiment
+    from emt.runner import replay as replay_run
+
+    loaded = load_experiment(config, [*(overrides or []), *([f"monte_carlo.seed={seed}"] * (seed is not None))])
+    result = replay_run(loaded, run)
+    folder = Path("results") / "replay" if out is None else out
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        stem = f"{loaded.name.replace('/', '-')}-run{run}"
+        (folder / f"{stem}.png").write_bytes(result.figure)
+        (folder / f"{stem}.csv").write_text(result.steps.render("csv"), encoding="utf-8")
+    except OSError as error:
+        raise Unusable(f"{folder}: cannot be written: {error.strerror or error}") from error
+    typer.echo(result.overview.render("text"), nl=False)
+    say(f"figure: {folder / f'{stem}.png'}\nvalues: {folder / f'{stem}.csv'}")

@@ -1,0 +1,176 @@
+"""The experiment: everything a configuration file may say."""
+
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, StringConstraints, create_model
+
+import emt.filters.catalogue
+import emt.metrics.catalogue
+import emt.scenarios.catalogue  # noqa: F401  (these three fill the registries)
+from emt.metrics.base import METRICS
+from emt.registry import FILTERS, SCENARIOS, Entry, Registry, UnknownName, suggest
+from emt.settings import (
+    AccelerationDensity,
+    Angle,
+    Covariance4,
+    KinematicNoise,
+    NoiseCovariance,
+    PositiveFloat,
+    PositiveLength,
+    Settings,
+    Vector4,
+)
+
+Label = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
+
+
+def known_metric(name: str) -> str:
+    """The name of a metric, checked."""
+    if name not in METRICS:
+        raise UnknownName(name, sorted(METRICS), suggest(name, METRICS), "metric")
+    return name
+
+
+MetricName = Annotated[str, AfterValidator(known_metric)]
+
+
+def union_of(registry: Registry[Any], kinds: tuple[str, ...] = ()) -> Any:
+    """The union, told apart by `kind`, of all built-in settings and of the plug-ins named in `kinds`."""
+    classes = [_with_kind(registry.get(name)) for name in dict.fromkeys((*registry.builtin(), *kinds))]
+    return Annotated[Union[tuple(classes)], Field(discriminator="kind")]  # noqa: UP007
+
+
+def _with_kind(entry: Entry[Any]) -> type:
+    """The settings of a kind; those of a plug-in accept the name under which the file asked for it."""
+    declared = entry.settings.model_fields.get("kind")
+    if declared is not None and declared.annotation == Literal[entry.name]:
+        return entry.settings
+    return create_model(entry.settings.__name__, __base__=entry.settings, kind=(Literal[entry.name], entry.name))
+
+
+class MonteCarlo(Settings):
+    """How many runs, and which."""
+
+    runs: Annotated[PositiveInt, Field(le=1_000_000_000)] = 100
+    smoke_runs: PositiveInt = 32
+    """Runs at the reduced scale of `emt check` and `emt reproduce --scale smoke`."""
+    seed: Annotated[NonNegativeInt, Field(lt=2**63)] = 0
+    chunk: Annotated[PositiveInt, Field(le=1_000_000)] | None = None
+    """Runs computed together, part of a result's identity; by default 208, and 1 for recordings. Multiples of 16 that
+    are no power of two are fastest."""
+    dtype: Literal["float64", "float32"] = "float64"
+
+
+class WhiteAccelerationSettings(Settings):
+    """Nearly constant velocity with white acceleration."""
+
+    kind: Literal["white_acceleration"] = "white_acceleration"
+    psd: AccelerationDensity
+    """Power spectral density of the acceleration on each axis."""
+
+
+class FixedNoiseSettings(Settings):
+    """The same process noise at every step."""
+
+    kind: Literal["fixed"] = "fixed"
+    cov: KinematicNoise
+    """Covariance added to (x, y, vx, vy) per step."""
+
+
+class PriorSettings(Settings):
+    """What every filter believes before the first scan. Its certainty about the shape is a setting of each filter."""
+
+    mean: Vector4
+    """Position and velocity: x, y, vx, vy."""
+    cov: Covariance4
+    orientation: Angle = 0.0
+    semi_axes: tuple[PositiveLength, PositiveLength]
+    """The first lies along `orientation`."""
+
+
+class ModelSettings(Settings):
+    """The world as every filter is told it is."""
+
+    process_noise: Annotated[WhiteAccelerationSettings | FixedNoiseSettings, Field(discriminator="kind")]
+    """Process noise of the constant-velocity motion."""
+    noise_cov: NoiseCovariance
+    """Covariance of the sensor noise of one point."""
+    extent_scale: PositiveFloat
+    """Covariance of the points on the object in units of the squared semi-axes: 0.25 uniform, 1 Gaussian."""
+    prior: PriorSettings
+
+
+class Divergence(Settings):
+    """When a run counts as lost, apart from numerical failure."""
+
+    position_error_above: PositiveLength
+
+
+class Sources(Settings):
+    """Where values come from: dotted keys of this file, each standing for everything below it."""
+
+    paper: tuple[str, ...] = ()
+    """Printed in the paper."""
+    published_code: tuple[str, ...] = ()
+    """Taken from public code of the paper's authors or of the method's authors."""
+    calibrated: tuple[str, ...] = ()
+    """Not printed anywhere: chosen so that the published results are met."""
+
+
+class Experiment(Settings):
+    """One scenario, the filters that are compared on it, and the metrics."""
+
+    name: str | None = None
+    """Name in results; by default that of the file, within its paper's folder."""
+    paper: str | None = None
+    """Key of the paper whose numbers stand in experiments/PAPER/published.yaml."""
+    title: str = ""
+    length_unit: Literal["m", "px"] = "m"
+    """Unit of every bare length, for headings; lengths with a unit of their own are metres."""
+    monte_carlo: MonteCarlo = MonteCarlo()
+    scenario: union_of(SCENARIOS)  # type: ignore[valid-type]
+    model: ModelSettings
+    start_with: Literal["update", "predict"] = "update"
+    """Whether the first scan is preceded by a prediction."""
+    filters: Annotated[dict[Label, union_of(FILTERS)], Field(min_length=1)]  # type: ignore[valid-type]
+    reference: str = "truth"
+    """What estimates are compared with: the truth, or the filter with this label."""
+    metrics: tuple[MetricName, ...] = ("gw", "iou", "position_rmse", "velocity_rmse", "nees")
+    skip_steps: NonNegativeInt = 0
+    """Steps at the start that do not count in the averages over time."""
+    divergence: Divergence | None = None
+    traces: bool = False
+    """Whether every estimate of every run is stored."""
+    sources: Sources = Sources()
+
+    @property
+    def chunk_size(self) -> int:
+        """Runs computed together."""
+        return self.monte_carlo.chunk or (208 if self.scenario.has_truth else 1)
+
+
+def model_for(data: Any) -> type[Experiment]:
+    """The settings class for a file's content: `Experiment`, widened by the plug-ins the file names.
+
+    Raises:
+        PluginError: a named plug-in cannot be used.
+    """
+    if not isinstance(data, dict):
+        return Experiment
+    filters, scenario = data.get("filters"), data.get("scenario")
+    named = [f.get("kind") for f in filters.values() if isinstance(f, dict)] if isinstance(filters, dict) else []
+    plugin_filters = _plugins(FILTERS, named)
+    plugin_scenarios = _plugins(SCENARIOS, [scenario.get("kind")] if isinstance(scenario, dict) else [])
+    if not plugin_filters and not plugin_scenarios:
+        return Experiment
+    return create_model(
+        "Experiment",
+        __base__=Experiment,
+        filters=(Annotated[dict[Label, union_of(FILTERS, plugin_filters)], Field(min_length=1)], ...),
+        scenario=(union_of(SCENARIOS, plugin_scenarios), ...),
+    )
+
+
+def _plugins(registry: Registry[Any], named: list[Any]) -> tuple[str, ...]:
+    candidates = {name for name in named if isinstance(name, str)} - set(registry.builtin())
+    return tuple(sorted(name for name in candidates if ":" in name or name in registry.names()))

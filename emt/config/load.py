@@ -1,0 +1,147 @@
+"""From a file or a shipped name to a checked experiment."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from emt.config.errors import ConfigError, Problem, dotted, validate
+from emt.config.experiment import Experiment, model_for
+from emt.config.overrides import apply_overrides
+from emt.config.shipped import SHIPPED, config_names, config_path
+from emt.config.source import Source, load_source
+from emt.registry import PluginError, UnknownName, suggest
+
+NOT_RESULTS = ("name", "paper", "title", "length_unit", "sources")
+"""Settings that name or explain; a result does not depend on them."""
+
+
+class Loaded(NamedTuple):
+    """An experiment and where it came from."""
+
+    name: str
+    """`PAPER/EXPERIMENT` for shipped experiments, otherwise the name the file gives itself, or its stem."""
+    experiment: Experiment
+    source: Source
+
+    def identity(self) -> dict[str, Any]:
+        """Everything the results depend on, as plain data; the number of runs is not part of it."""
+        config = self.experiment.model_dump(mode="json", exclude=set(NOT_RESULTS))
+        run = config.pop("monte_carlo")
+        if config["scenario"]["kind"] == "recorded":
+            config["scenario"].pop("path")  # the recording is known by its hash
+        return {
+            "experiment": self.name,
+            "config": config,
+            "seed": run["seed"],
+            "chunk": self.experiment.chunk_size,
+            "dtype": run["dtype"],
+        }
+
+
+def find_config(text: str) -> Path:
+    """The file meant by a path or by the name of a shipped experiment.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    path = Path(text)
+    if path.is_file():
+        return path
+    if text in config_names():
+        return config_path(text)
+    if path.suffix in (".yaml", ".yml") or path.exists():
+        return path  # reading it says what is wrong
+    near = suggest(text, config_names())
+    hint = f" (did you mean '{near}'?)" if near else ""
+    message = f"neither a file nor a shipped experiment{hint}; shipped: {', '.join(config_names())}"
+    raise ConfigError([Problem(text, None, "", message)])
+
+
+def load_experiment(text: str, overrides: Iterable[str] = ()) -> Loaded:
+    """Reads, overrides and checks an experiment.
+
+    Args:
+        text: a path, or the name of a shipped experiment.
+        overrides: texts `key=value`.
+
+    Raises:
+        ConfigError: with every problem found.
+    """
+    path = find_config(text)
+    source = apply_overrides(load_source(path), overrides)
+    if str(path.parent.resolve()) not in sys.path:
+        sys.path.append(str(path.parent.resolve()))  # a plug-in may stand beside the file that names it
+    try:
+        model = model_for(source.data)
+    except PluginError as error:
+        raise ConfigError([problem_at(source, ("filters",), str(error))]) from error
+    experiment = resolve_paths(validate(model, source), source)
+    problems = list(contradictions(experiment, source))
+    if problems:
+        raise ConfigError(problems)
+    return Loaded(experiment_name(path, experiment), experiment, source)
+
+
+def experiment_name(path: Path, experiment: Experiment) -> str:
+    """See `Loaded.name`."""
+    if experiment.name is not None:
+        return experiment.name
+    resolved = path.resolve()
+    root = SHIPPED.resolve() / "configs"
+    return resolved.relative_to(root).with_suffix("").as_posix() if root in resolved.parents else path.stem
+
+
+def resolve_paths(experiment: Experiment, source: Source) -> Experiment:
+    """A recording is looked for beside its configuration first, then from the working directory."""
+    scenario = experiment.scenario
+    given = getattr(scenario, "path", None)
+    if scenario.kind != "recorded" or given is None:
+        return experiment
+    beside = Path(source.path).parent / given
+    found = beside if beside.is_file() else Path(given)
+    return experiment.model_copy(update={"scenario": scenario.model_copy(update={"path": str(found)})})
+
+
+def problem_at(source: Source, key_path: Sequence[str | int], message: str) -> Problem:
+    """A problem at the place of a key."""
+    place = source.place(key_path)
+    return Problem(place.file, place.line, dotted(key_path), message)
+
+
+def contradictions(experiment: Experiment, source: Source) -> Iterable[Problem]:
+    """What no single setting shows: names that refer to nothing, and settings that exclude each other."""
+
+    for k, name in enumerate(experiment.metrics):
+        if name in experiment.metrics[:k]:
+            yield problem_at(source, ("metrics", k), f"'{name}' is listed twice")
+    labels = ["truth", *experiment.filters]
+    if "truth" in experiment.filters:
+        yield problem_at(source, ("filters", "truth"), "a filter cannot be called 'truth'")
+    if experiment.reference not in labels:
+        name = UnknownName(experiment.reference, labels, suggest(experiment.reference, labels), "reference")
+        yield problem_at(source, ("reference",), str(name))
+    if not experiment.scenario.has_truth:
+        if experiment.metrics and experiment.reference == "truth":
+            message = "this scenario has no ground truth: set metrics: [] or name a filter as reference"
+            yield problem_at(source, ("metrics",), message)
+        if experiment.divergence is not None:
+            yield problem_at(source, ("divergence",), "this scenario has no ground truth to diverge from")
+    n_steps = getattr(experiment.scenario, "n_steps", None)
+    if n_steps is not None and experiment.skip_steps >= n_steps:
+        message = f"must be less than the {n_steps} steps of the scenario, got {experiment.skip_steps}"
+        yield problem_at(source, ("skip_steps",), message)
+    resolved = experiment.model_dump(mode="json")
+    for group, keys in experiment.sources:
+        for k, key in enumerate(keys):
+            if not has_key(resolved, key.split(".")):
+                yield problem_at(source, ("sources", group, k), f"'{key}' is not a setting of this file")
+
+
+def has_key(data: Any, path: Sequence[str]) -> bool:
+    """Whether nested mappings hold a value under these keys."""
+    for part in path:
+        if not isinstance(data, dict) or part not in data:
+            return False
+        data = data[part]
+    return True

@@ -1,0 +1,162 @@
+"""What every filter shares: the model it is told, the door that screens scans, and the guard that keeps states sound."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import register_dataclass
+from jaxtyping import Array, Bool, Float, Int
+
+from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
+from emt.models.motion import MotionNoise
+from emt.status import Status
+from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Scalar, State
+
+GROSS_INNOVATION = 10.0
+"""An innovation of more than this many predicted standard deviations sets `Status.GROSS_INNOVATION`."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class TrackingModel:
+    """The part of the world model that all filters of an experiment are told alike (traced numbers)."""
+
+    noise: MotionNoise
+    """Process noise of the constant-velocity motion."""
+    sensor_noise: Sym2
+    """Covariance of the sensor noise of one point (m²)."""
+    extent_scale: Scalar
+    """Covariance of the points over the object in units of the squared semi-axes: 1/4 for a uniform ellipse, 1 for
+    Gaussian points whose covariance is the extent."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class ScanStatistics:
+    """Count, mean and scatter of the points of a scan: all that an order-free elliptical filter needs."""
+
+    count: Scalar
+    mean: Vec2
+    scatter: Sym2
+    """Sum of the outer products of the points about their mean (m²)."""
+
+
+def scan_statistics(scan: Measurements) -> ScanStatistics:
+    """Statistics of the real points of a scan; zeros for an empty one."""
+    x, y = jnp.where(scan.mask, scan.points[:, 0], 0.0), jnp.where(scan.mask, scan.points[:, 1], 0.0)
+    count = scan.mask.sum(dtype=scan.points.dtype)
+    share = 1.0 / jnp.maximum(count, 1.0)
+    mean = Vec2(share * x.sum(), share * y.sum())
+    dx, dy = jnp.where(scan.mask, x - mean.x, 0.0), jnp.where(scan.mask, y - mean.y, 0.0)
+    return ScanStatistics(count, mean, Sym2((dx * dx).sum(), (dx * dy).sum(), (dy * dy).sum()))
+
+
+def innovation_info(position: Vec2, position_cov: Sym2, spread: Sym2, scan: Measurements) -> Info:
+    """Diagnostics of a scan against the prediction.
+
+    Args:
+        position, position_cov: predicted centre and its covariance.
+        spread: predicted covariance of one point about the centre, sensor noise included (m²).
+        scan: the screened scan.
+
+    The likelihood treats the points as Gaussian about the centre:
+    log N(ȳ; p, C + Y/m) - (m-1)/2 log|2πY| - ½ tr(Y⁻¹ scatter) - log m.
+    """
+    stats = scan_statistics(scan)
+    seen = stats.count > 0.0
+    count = jnp.maximum(stats.count, 1.0)
+    innovation_cov = position_cov + (1.0 / count) * spread
+    nis = innovation_cov.inverse().quadratic(stats.mean - position)
+    log_likelihood = (
+        -0.5 * (nis + jnp.log(innovation_cov.det()))
+        - 0.5 * (count - 1.0) * jnp.log(spread.det())
+        - 0.5 * spread.inverse().inner(stats.scatter)
+        - count * jnp.log(2.0 * jnp.pi)
+        - jnp.log(count)
+    )
+    weight = (position_cov + spread).inverse()
+    dx, dy = scan.points[:, 0] - position.x, scan.points[:, 1] - position.y
+    distances = weight.xx * dx * dx + 2.0 * weight.xy * dx * dy + weight.yy * dy * dy
+    gross = (scan.mask & (distances > GROSS_INNOVATION**2)).any()
+    return Info(
+        log_likelihood=jnp.where(seen, log_likelihood, 0.0),
+        nis=jnp.where(seen, nis, 0.0),
+        status=jnp.where(gross, int(Status.GROSS_INNOVATION), 0),
+    )
+
+
+def screen(scan: Measurements) -> tuple[Measurements, Bool[Array, ""]]:
+    """Takes out points that are not finite, or so large that their fourth power is not; padding becomes zero.
+
+    Returns the clean scan and whether a point was taken out.
+    """
+    limit = float(jnp.finfo(scan.points.dtype).max) ** 0.25 / 16.0
+    sound = (jnp.abs(scan.points) < limit).all(axis=1)  # False for NaN
+    mask = scan.mask & sound
+    points = jnp.where(mask[:, None], scan.points, 0.0)
+    return Measurements(points, mask, scan.overflow), (scan.mask & ~sound).any()
+
+
+def keep_if(condition: Bool[Array, ""], new, old):
+    """`new` where the condition holds, else `old`, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def estimate_status(estimate: Estimate) -> Int[Array, ""]:
+    """Status bits of what a filter is about to report: finite, covariances and extent positive definite."""
+    sound = is_positive_definite(Sym2.of(estimate.cov[:2, :2])) & is_positive_definite(Sym2.of(estimate.cov[2:, 2:]))
+    if isinstance(estimate.shape, Ellipse):
+        sound = sound & (estimate.shape.semi_axes > 0.0).all()
+    bits = jnp.where(sound, 0, int(Status.NOT_POSITIVE_DEFINITE))
+    return jnp.where(all_finite(estimate), bits, int(Status.NON_FINITE))
+
+
+class Guarded(NamedTuple):
+    """State of a guarded filter."""
+
+    state: State
+    last: State
+    """The sound state after the last update."""
+
+
+def guarded(flt: Filter) -> Filter:
+    """The filter behind a door and a guard.
+
+    The door screens every scan and leaves the prediction exactly as it is when nothing is left of the scan. The guard
+    is the last resort: where a step would report a number that is not finite or a covariance that is not positive
+    definite, it goes back to the state after the last update and sets a bit.
+    """
+
+    def init(prior, key):
+        state = flt.init(prior, key)
+        return Guarded(state, state)
+
+    def predict(guard, dt, key):
+        return Guarded(flt.predict(guard.state, dt, key), guard.last)
+
+    def update(guard, scan, key):
+        scan, skipped = screen(scan)
+        new, info = flt.update(guard.state, scan, key)
+        new = keep_if(scan.mask.any(), new, guard.state)
+        status = jnp.where(all_finite(new), estimate_status(flt.estimate(new)), int(Status.NON_FINITE))
+        state = keep_if(status == 0, new, guard.last)
+        status = status | info.status
+        status = status | jnp.where(skipped, int(Status.MEASUREMENT_SKIPPED), 0)
+        status = status | jnp.where(scan.overflow, int(Status.SCAN_OVERFLOW), 0)
+        finite = jnp.isfinite(info.log_likelihood) & jnp.isfinite(info.nis)
+        return Guarded(state, state), Info(
+            jnp.where(finite, info.log_likelihood, 0.0), jnp.where(finite, info.nis, 0.0), status
+        )
+
+    return Filter(init, predict, update, lambda guard: flt.estimate(guard.state))
+
+
+def as_scan(points: Float[Array, "n 2"], capacity: int | None = None) -> Measurements:
+    """A scan holding these points, padded to `capacity` (default: no padding, but at least one slot)."""
+    n = points.shape[0]
+    capacity = max(n, 1) if capacity is None else capacity
+    if n > capacity:
+        raise ValueError(f"{n} points do not fit a scan of capacity {capacity}")
+    padded = jnp.zeros((capacity, 2), points.dtype).at[:n].set(points)
+    return Measurements(padded, jnp.arange(capacity) < n, jnp.asarray(False))

@@ -1,0 +1,220 @@
+"""Gaussian-process contour tracker."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve
+from jax.tree_util import register_dataclass
+from jaxtyping import Array, Float
+from pydantic import PositiveInt
+
+from emt.filters.base import TrackingModel, innovation_info
+from emt.linalg import Sym2, Vec2
+from emt.registry import FILTERS
+from emt.settings import (
+    AngleVariance,
+    NonNegativeFloat,
+    PositiveAngle,
+    PositiveAngleVariance,
+    PositiveLength,
+    Settings,
+)
+from emt.types import Estimate, Filter, Measurements, Prior, Scalar, StarConvex
+
+N_MOTION = 6
+"""State entries before the radii: centre (2), orientation, velocity (2), turn rate."""
+JITTER = 1e-6
+"""Added to the diagonal of the radii's covariance before it is inverted, as in the authors' code (m²)."""
+
+
+class GpEttSettings(Settings):
+    """Gaussian-process contour tracker (Wahlström and Özkan 2015). Expects points on the outline."""
+
+    kind: Literal["gp_ett"] = "gp_ett"
+    basis_angles: PositiveInt = 50
+    """Number of equally spaced angles at which the radius is estimated."""
+    radius_std: PositiveLength = 2.0
+    """Standard deviation of the radius about its mean, the part that varies along the contour."""
+    offset_std: PositiveLength = 0.8
+    """Standard deviation of the part of the radius that all angles share."""
+    length_scale: PositiveAngle = 0.39269908169872414
+    """Angle over which the radius is correlated."""
+    orientation_variance: PositiveAngleVariance = 1e-5
+    """Prior variance of the orientation."""
+    turn_rate_variance: PositiveAngleVariance = 1e-5
+    """Prior variance of the turn rate (rad²/s²)."""
+    turn_acceleration_psd: AngleVariance = 1e-8
+    """Power spectral density of the angular acceleration (rad²/s³)."""
+    forgetting_rate: NonNegativeFloat = 1e-4
+    """Rate at which the radii return to zero mean (1/s)."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Params:
+    """Traced numbers of the filter."""
+
+    radius_var: Scalar
+    offset_var: Scalar
+    length_scale: Scalar
+    orientation_variance: Scalar
+    turn_rate_variance: Scalar
+    turn_acceleration_psd: Scalar
+    forgetting_rate: Scalar
+
+
+class GpState(NamedTuple):
+    """Joint Gaussian over (centre, orientation, velocity, turn rate, radii)."""
+
+    mean: Float[Array, "n_state"]
+    cov: Float[Array, "n_state n_state"]
+
+
+class Contour(NamedTuple):
+    """The Gaussian process of the outline at the basis angles."""
+
+    angles: Float[Array, "n_angles"]
+    cov: Float[Array, "n_angles n_angles"]
+    inverse: Float[Array, "n_angles n_angles"]
+
+
+def kernel(u: Float[Array, "..."], v: Float[Array, "..."], params: Params) -> Float[Array, "..."]:
+    """Covariance of the radii at two angles (m²), or at the angles of two arrays that broadcast."""
+    return params.radius_var * jnp.exp(-2.0 * jnp.sin(0.5 * (u - v)) ** 2 / params.length_scale**2) + params.offset_var
+
+
+def contour(angles: Float[Array, "n_angles"], params: Params) -> Contour:
+    """Covariance of the radii at the basis angles and its inverse."""
+    cov = kernel(angles[:, None], angles[None, :], params)
+    eye = jnp.eye(angles.shape[0], dtype=angles.dtype)
+    return Contour(angles, cov, jnp.linalg.inv(cov + JITTER * eye))
+
+
+def predict(state: GpState, dt: Scalar, gp: Contour, model: TrackingModel, params: Params) -> GpState:
+    """Time update: constant velocity and turn rate; radii decay towards zero (Wahlström and Özkan 2015, Sec. IV)."""
+    n = gp.angles.shape[0]
+    dtype = state.mean.dtype
+    motion = jnp.eye(N_MOTION, dtype=dtype) + dt * jnp.eye(N_MOTION, k=3, dtype=dtype)
+    noise4 = model.noise(dt).array()
+    q = params.turn_acceleration_psd
+    plane = jnp.array([0, 1, 3, 4])
+    noise = jnp.zeros((N_MOTION, N_MOTION), dtype).at[plane[:, None], plane[None, :]].set(noise4)
+    noise = noise.at[2, 2].set(q * dt**3 / 3.0).at[2, 5].set(q * dt**2 / 2.0)
+    noise = noise.at[5, 2].set(q * dt**2 / 2.0).at[5, 5].set(q * dt)
+    decay = jnp.exp(-params.forgetting_rate * dt)
+
+    def transition(block):
+        """F times a matrix of n_state rows."""
+        return jnp.concatenate([motion @ block[:N_MOTION], decay * block[N_MOTION:]])
+
+    full_noise = jnp.zeros((N_MOTION + n, N_MOTION + n), dtype)
+    full_noise = full_noise.at[:N_MOTION, :N_MOTION].set(noise)
+    full_noise = full_noise.at[N_MOTION:, N_MOTION:].set((1.0 - decay**2) * gp.cov)
+    return GpState(transition(state.mean), symmetrise(transition(transition(state.cov).T) + full_noise))
+
+
+def measurement(mean, point: Vec2, gp: Contour, model: TrackingModel, params: Params):
+    """Predicted point, Jacobian (2, n_state) and noise (2, 2) of one contour point.
+
+    The predicted centre and orientation fix the angle at which the point is seen. As in the authors' code, the
+    derivative of the kernel acts on the whole kernel, its constant part included.
+
+    Source: Wahlström and Özkan 2015, eqs. 22-29 and appendix.
+    """
+    d = jnp.stack([point.x - mean[0], point.y - mean[1]])
+    distance = jnp.sqrt(d @ d)
+    safe = jnp.where(distance > 0.0, distance, 1.0)
+    o = jnp.where(distance > 0.0, d / safe, jnp.array([1.0, 0.0], d.dtype))
+    angle = jnp.arctan2(o[1], o[0]) - mean[2]
+    row = kernel(angle, gp.angles, params)
+    weights = gp.inverse @ row
+    slope = gp.inverse @ (-jnp.sin(angle - gp.angles) * row / params.length_scale**2)
+    radii = mean[N_MOTION:]
+    radius, radius_slope = weights @ radii, slope @ radii
+    unit_by_centre = (jnp.outer(o, o) - jnp.eye(2, dtype=d.dtype)) / safe
+    angle_by_centre = jnp.stack([o[1], -o[0]]) / safe
+    by_centre = jnp.eye(2, dtype=d.dtype) + radius * unit_by_centre + radius_slope * jnp.outer(o, angle_by_centre)
+    jacobian = jnp.concatenate(
+        [by_centre, -radius_slope * o[:, None], jnp.zeros((2, 3), d.dtype), jnp.outer(o, weights)], axis=1
+    )
+    residual_var = kernel(angle, angle, params) - row @ weights
+    return mean[:2] + radius * o, jacobian, model.sensor_noise.array() + residual_var * jnp.outer(o, o)
+
+
+def update(state: GpState, scan: Measurements, gp: Contour, model: TrackingModel, params: Params) -> GpState:
+    """One extended Kalman update with all points of the scan, in Joseph form."""
+    n_points = scan.mask.shape[0]
+    expected, jacobian, noise = jax.vmap(lambda point: measurement(state.mean, Vec2.of(point), gp, model, params))(
+        scan.points
+    )
+    real = scan.mask[:, None]
+    innovation = jnp.where(real, scan.points - expected, 0.0).reshape(2 * n_points)
+    # padding rows: no information (zero Jacobian), unit noise
+    h = jnp.where(real[:, :, None], jacobian, 0.0).reshape(2 * n_points, -1)
+    r = jax.scipy.linalg.block_diag(*jnp.where(real[:, :, None], noise, jnp.eye(2, dtype=noise.dtype)))
+    innovation_cov = symmetrise(h @ state.cov @ h.T + r)
+    gain = cho_solve(cho_factor(innovation_cov, lower=True), h @ state.cov).T
+    rest = jnp.eye(state.mean.shape[0], dtype=state.mean.dtype) - gain @ h
+    cov = rest @ state.cov @ rest.T + gain @ r @ gain.T
+    return GpState(state.mean + gain @ innovation, symmetrise(cov))
+
+
+def symmetrise(m: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """(M + Mᵀ)/2."""
+    return 0.5 * (m + m.T)
+
+
+def gp_ett(basis_angles: int, params: Params, model: TrackingModel) -> Filter:
+    """Gaussian-process contour tracker.
+
+    Source: N. Wahlström and E. Özkan, IEEE Trans. Signal Process. 63 (2015), doi:10.1109/TSP.2015.2424194.
+    """
+    dtype = jnp.result_type(params.radius_var)
+    gp = contour(jnp.arange(basis_angles, dtype=dtype) * (2.0 * jnp.pi / basis_angles), params)
+    kinematic = jnp.array([0, 1, 3, 4])
+
+    def init(prior: Prior, key) -> GpState:
+        a, b = prior.ellipse.semi_axes[0], prior.ellipse.semi_axes[1]
+        radii = a * b / jnp.sqrt((b * jnp.cos(gp.angles)) ** 2 + (a * jnp.sin(gp.angles)) ** 2)
+        mean = jnp.zeros(N_MOTION + basis_angles, dtype).at[kinematic].set(prior.mean)
+        mean = mean.at[2].set(prior.ellipse.orientation).at[N_MOTION:].set(radii)
+        cov = jnp.zeros((N_MOTION + basis_angles, N_MOTION + basis_angles), dtype)
+        cov = cov.at[kinematic[:, None], kinematic[None, :]].set(prior.cov)
+        cov = cov.at[2, 2].set(params.orientation_variance).at[5, 5].set(params.turn_rate_variance)
+        return GpState(mean, cov.at[N_MOTION:, N_MOTION:].set(gp.cov))
+
+    def update_step(state: GpState, scan: Measurements, key):
+        radii = state.mean[N_MOTION:]
+        spread_var = model.extent_scale * jnp.mean(radii**2)
+        spread = Sym2(spread_var, jnp.zeros_like(spread_var), spread_var) + model.sensor_noise
+        info = innovation_info(Vec2.of(state.mean), Sym2.of(state.cov[:2, :2]), spread, scan)
+        return update(state, scan, gp, model, params), info
+
+    def estimate(state: GpState) -> Estimate:
+        return Estimate(
+            state.mean[kinematic],
+            state.cov[kinematic[:, None], kinematic[None, :]],
+            StarConvex(state.mean[N_MOTION:], state.mean[2]),
+        )
+
+    return Filter(init, lambda state, dt, key: predict(state, dt, gp, model, params), update_step, estimate)
+
+
+def build(settings: GpEttSettings):
+    """Traced parameters and static builder of the settings."""
+    params = Params(
+        settings.radius_std**2,
+        settings.offset_std**2,
+        settings.length_scale,
+        settings.orientation_variance,
+        settings.turn_rate_variance,
+        settings.turn_acceleration_psd,
+        settings.forgetting_rate,
+    )
+    n = settings.basis_angles
+    return params, lambda params, model: gp_ett(n, params, model)
+
+
+FILTERS.register("gp_ett", GpEttSettings, build)

@@ -1,0 +1,178 @@
+"""The posterior of the elliptical model by Monte Carlo: a slow reference for single updates."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.tree_util import register_dataclass
+from jaxtyping import Array, Float
+from pydantic import Field
+
+from emt.filters import kinematics
+from emt.filters import vb_random_matrix as vb
+from emt.filters.base import ScanStatistics, TrackingModel, innovation_info, scan_statistics
+from emt.linalg import Sym2, Vec2, parallel
+from emt.registry import FILTERS
+from emt.settings import PositiveAngleVariance, Settings, ShapeParameter
+from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar
+
+
+class SampledPosteriorSettings(Settings):
+    """Posterior by importance sampling from the prior, with the kinematics integrated exactly.
+
+    The prior is that of `vb_random_matrix`. After an update the posterior is matched by a member of the same family,
+    so it can be used over several scans, but it is meant as the reference of single updates.
+    """
+
+    kind: Literal["sampled_posterior"] = "sampled_posterior"
+    samples: Annotated[int, Field(ge=1_000, le=10_000_000)] = 1_000_000
+    shape: tuple[ShapeParameter, ShapeParameter] = (10.0, 10.0)
+    """Prior inverse-gamma shapes of the squared semi-axes."""
+    orientation_variance: PositiveAngleVariance = 0.2
+    """Prior variance of the orientation."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Params:
+    """Traced numbers of the filter."""
+
+    shape: tuple[Scalar, Scalar]
+    orientation_variance: Scalar
+
+
+class SampledState(NamedTuple):
+    """The matched posterior and the ellipse of posterior medians."""
+
+    matched: vb.VbState
+    median: Ellipse
+
+
+class Samples(NamedTuple):
+    """Weighted samples of orientation and squared semi-axes with the position given each of them."""
+
+    orientation: Float[Array, "n"]
+    x1: Float[Array, "n"]
+    x2: Float[Array, "n"]
+    log_weight: Float[Array, "n"]
+    position: Vec2
+    position_cov: Sym2
+
+
+def draw(state: vb.VbState, stats: ScanStatistics, model: TrackingModel, key, n: int) -> Samples:
+    """Samples from the prior, weighted with the likelihood of the scan given orientation and extent.
+
+    The likelihood factors into that of the scan mean, N(ȳ; p, C + Y/m), and that of the scatter about it,
+    |Y|^(-(m-1)/2) exp(-½ tr(Y⁻¹ scatter)), with Y = s L X Lᵀ + R.
+    """
+    angle_key, first, second = jax.random.split(key, 3)
+    dtype = stats.count.dtype
+    normal = jax.random.normal(angle_key, (n,), dtype)
+    orientation = state.orientation + jnp.sqrt(state.orientation_var) * normal
+    x1 = state.scale.x / jax.random.gamma(first, state.shape.x, (n,), dtype)
+    x2 = state.scale.y / jax.random.gamma(second, state.shape.y, (n,), dtype)
+
+    def weigh(theta, a, b):
+        m = jnp.maximum(stats.count, 1.0)
+        extent = Sym2.ellipse(jnp.sqrt(a), jnp.sqrt(b), theta)
+        spread = model.extent_scale * extent + model.sensor_noise
+        mean_noise = (1.0 / m) * spread
+        belief = state.kinematics
+        innovation_cov = belief.position_cov + mean_noise
+        innovation = stats.mean - belief.position
+        weight = innovation_cov.inverse()
+        log_weight = -0.5 * (
+            weight.quadratic(innovation)
+            + jnp.log(innovation_cov.det())
+            + (m - 1.0) * jnp.log(spread.det())
+            + spread.inverse().inner(stats.scatter)
+        )
+        position = belief.position + belief.position_cov @ (weight @ innovation)
+        return log_weight, position, parallel(belief.position_cov, mean_noise)
+
+    log_weight, position, position_cov = jax.vmap(weigh)(orientation, x1, x2)
+    return Samples(orientation, x1, x2, log_weight, position, position_cov)
+
+
+def weighted_median(values: Float[Array, "n"], weights: Float[Array, "n"]) -> Scalar:
+    """The value at which half of the (normalised) weight is reached."""
+    order = jnp.argsort(values)
+    reached = jnp.cumsum(weights[order])
+    return values[order][jnp.searchsorted(reached, 0.5 * reached[-1])]
+
+
+def match(state: vb.VbState, samples: Samples) -> SampledState:
+    """Moment matching: Gaussian position and orientation; inverse gammas by E[X] and E[1/X]."""
+    weights = jnp.exp(samples.log_weight - samples.log_weight.max())
+    weights = weights / weights.sum()
+
+    def mean(values):
+        return (weights * values).sum()
+
+    position = Vec2(mean(samples.position.x), mean(samples.position.y))
+    dx, dy = samples.position.x - position.x, samples.position.y - position.y
+    cov = samples.position_cov
+    position_cov = Sym2(mean(cov.xx + dx * dx), mean(cov.xy + dx * dy), mean(cov.yy + dy * dy))
+    orientation = mean(samples.orientation)
+    orientation_var = mean((samples.orientation - orientation) ** 2)
+
+    def inverse_gamma(values):
+        inverse = mean(1.0 / values)
+        product = mean(values) * inverse  # = α / (α - 1) > 1
+        shape = product / (product - 1.0)
+        return shape, shape / inverse
+
+    (a1, b1), (a2, b2) = inverse_gamma(samples.x1), inverse_gamma(samples.x2)
+    belief = kinematics.with_position(state.kinematics, position, position_cov)
+    axes = jnp.sqrt(jnp.stack([weighted_median(samples.x1, weights), weighted_median(samples.x2, weights)]))
+    median = Ellipse(axes, weighted_median(samples.orientation, weights))
+    return SampledState(vb.VbState(belief, orientation, orientation_var, Vec2(a1, a2), Vec2(b1, b2)), median)
+
+
+def effective_sample_size(samples: Samples) -> Scalar:
+    """1 / Σ w² of the normalised weights."""
+    weights = jnp.exp(samples.log_weight - samples.log_weight.max())
+    return weights.sum() ** 2 / (weights**2).sum()
+
+
+def sampled_posterior(n: int, params: Params, model: TrackingModel) -> Filter:
+    """Reference posterior of the model of Tuncer and Özkan 2021, Sec. II, by self-normalised importance sampling."""
+    # the time update, where one is asked for, is that of a static shape
+    still = vb.Params(
+        params.shape,
+        params.orientation_variance,
+        jnp.zeros_like(params.orientation_variance),
+        jnp.ones_like(params.orientation_variance),
+    )
+    closed_form = vb.vb_random_matrix(1, still, model)
+
+    def init(prior: Prior, key) -> SampledState:
+        return SampledState(closed_form.init(prior, key), prior.ellipse)
+
+    def predict(state: SampledState, dt: Scalar, key) -> SampledState:
+        return SampledState(vb.predict(state.matched, dt, model, still), state.median)
+
+    def update(state: SampledState, scan: Measurements, key):
+        matched = state.matched
+        axes = vb.semi_axes(matched)
+        spread = model.extent_scale * Sym2.ellipse(axes.x, axes.y, matched.orientation) + model.sensor_noise
+        belief = matched.kinematics
+        info = innovation_info(belief.position, belief.position_cov, spread, scan)
+        return match(matched, draw(matched, scan_statistics(scan), model, key, n)), info
+
+    def estimate(state: SampledState) -> Estimate:
+        belief = state.matched.kinematics
+        return Estimate(belief.mean(), belief.cov(), state.median)
+
+    return Filter(init, predict, update, estimate)
+
+
+def build(settings: SampledPosteriorSettings):
+    """Traced parameters and static builder of the settings."""
+    params = Params(settings.shape, settings.orientation_variance)
+    n = settings.samples
+    return params, lambda params, model: sampled_posterior(n, params, model)
+
+
+FILTERS.register("sampled_posterior", SampledPosteriorSettings, build)

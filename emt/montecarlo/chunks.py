@@ -1,0 +1,113 @@
+"""Many runs: chunks of fixed size, from run numbers to the arrays that are stored."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emt.montecarlo.program import Program, Simulation
+from emt.montecarlo.run import Scores, as_truth
+from emt.status import FAILURE
+
+BLOCKS = 8
+"""Groups of runs per chunk whose sums per step are kept apart, for standard errors of root-mean-square metrics."""
+
+
+def chunk_runs(start: int, stop: int, chunk_size: int) -> np.ndarray:
+    """Run numbers of a chunk, padded to the fixed size with repetitions of the last one."""
+    return np.minimum(np.arange(start, start + chunk_size), stop - 1)
+
+
+def score_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
+    """What is stored of one filter's scores of the first `n` runs of a chunk.
+
+    `values` (run, metric), `status`, `failed_step` and `nis`, its mean over steps (run); over the runs without
+    failure, per block of runs, `step_sum` (block, step, metric) and `step_count` (block); and `step_squares`
+    (step, metric).
+    """
+    rows, status = np.asarray(scores.per_step)[:n].astype(np.float64), np.asarray(scores.status)[:n]
+    sound = (status & int(FAILURE)) == 0
+    kept = np.where(sound[:, None, None], rows, 0.0)
+    edges = np.linspace(0, n, BLOCKS + 1).astype(int)
+    blocks = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return {
+        f"{label}/values": np.asarray(scores.values)[:n].astype(np.float64),
+        f"{label}/status": status.astype(np.int32),
+        f"{label}/failed_step": np.asarray(scores.failed_step)[:n].astype(np.int32),
+        f"{label}/nis": np.asarray(scores.track.nis)[:n].mean(axis=1, dtype=np.float64),
+        f"{label}/step_sum": np.stack([kept[block].sum(axis=0) for block in blocks]),
+        f"{label}/step_count": np.array([sound[block].sum() for block in blocks]),
+        f"{label}/step_squares": (kept**2).sum(axis=0),
+    }
+
+
+def track_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
+    """Every report of a filter in the first `n` runs of a chunk."""
+    fields = scores.track._asdict() | {"per_step": scores.per_step}
+    return {f"{label}/track/{name}": np.asarray(value)[:n] for name, value in fields.items() if value is not None}
+
+
+def scan_arrays(simulation: Simulation, has_truth: bool, n: int) -> dict[str, np.ndarray]:
+    """Scans, and the truth where there is one, of the first `n` runs of a chunk."""
+    arrays = {"scans/points": simulation.scans.points, "scans/mask": simulation.scans.mask}
+    if has_truth:
+        truth = simulation.truth
+        arrays |= {
+            "truth/position": truth.position,
+            "truth/velocity": truth.velocity,
+            "truth/semi_axes": truth.ellipse.semi_axes,
+            "truth/orientation": truth.ellipse.orientation,
+        }
+    return {name: np.asarray(value)[:n] for name, value in arrays.items()}
+
+
+class Engine:
+    """Runs chunks of one experiment; compiled once, for the chunk size."""
+
+    def __init__(self, program: Program, seed: int, chunk_size: int):
+        self.program, self.seed, self.chunk_size = program, jnp.asarray(seed), chunk_size
+        self._compiled: dict[str, Any] = {}
+
+    def labels(self) -> list[str]:
+        """Filters in the order of computation: a reference filter first."""
+        labels, reference = list(self.program.experiment.filters), self.program.experiment.reference
+        return sorted(labels, key=lambda label: label != reference)
+
+    def compile(self, on_start: Callable[[str], None] = lambda name: None) -> None:
+        """Compiles simulator and filters, two at a time."""
+        program, runs = self.program, jnp.zeros(self.chunk_size, int)
+        simulator = program.simulator()
+        shapes = jax.eval_shape(simulator, program.world, self.seed, runs)
+
+        def build(name: str):
+            on_start(name or "scenario")
+            if not name:
+                return simulator.lower(program.world, self.seed, runs).compile()
+            arguments = (program.world, program.filter_params[name], self.seed, runs, shapes.scans, shapes.truth)
+            return program.scorer(name).lower(*arguments).compile()
+
+        names = ["", *self.labels()]
+        with ThreadPoolExecutor(2) as pool:
+            self._compiled = dict(zip(names, pool.map(build, names), strict=True))
+
+    def run_chunk(self, start: int, stop: int, *, tracks: bool = False) -> dict[str, np.ndarray]:
+        """Arrays of the runs `start` to `stop - 1`, by name; with every report and scan if asked for."""
+        program, n = self.program, stop - start
+        experiment, world = program.experiment, program.world
+        runs = jnp.asarray(chunk_runs(start, stop, self.chunk_size))
+        simulation = self._compiled[""](world, self.seed, runs)
+        target, arrays = simulation.truth, {}
+        for label in self.labels():
+            params = program.filter_params[label]
+            scores = self._compiled[label](world, params, self.seed, runs, simulation.scans, target)
+            if label == experiment.reference:
+                target = jax.vmap(as_truth)(scores.track)
+            arrays |= score_arrays(label, scores, n)
+            if tracks or experiment.traces:
+                arrays |= track_arrays(label, scores, n)
+        if tracks or experiment.traces:
+            arrays |= scan_arrays(simulation, experiment.scenario.has_truth, n)
+        return arrays

@@ -1,0 +1,123 @@
+"""An experiment as compiled functions of (seed, run numbers): the simulator and one program per filter."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emt.config.experiment import Experiment
+from emt.filters.base import TrackingModel, guarded
+from emt.keys import Purpose, filter_key, purpose_key, run_key
+from emt.linalg import Sym2
+from emt.metrics.base import METRICS, Metric
+from emt.models.motion import FixedNoise, WhiteAcceleration
+from emt.montecarlo.run import Rules, Scores, Tracker, score
+from emt.registry import FILTERS, SCENARIOS
+from emt.types import Ellipse, Measurements, Prior, Scalar, Scenario, Truth
+
+
+class Simulation(NamedTuple):
+    """Truth and scans of a chunk of runs; leading axes run, time."""
+
+    truth: Truth
+    scans: Measurements
+
+
+class WorldParams(NamedTuple):
+    """Traced numbers that all filters share."""
+
+    scenario: Any
+    model: TrackingModel
+    prior: Prior
+    position_limit: Scalar
+
+
+def cast(tree, dtype):
+    """Every floating-point leaf in the given precision; other leaves as they are."""
+
+    def leaf(x):
+        array = np.asarray(x)
+        return jnp.asarray(array, dtype if array.dtype.kind == "f" else array.dtype)
+
+    return jax.tree.map(leaf, tree)
+
+
+@dataclass(frozen=True)
+class Program:
+    """What an experiment computes. The functions take chunks of run numbers; the numbers of a run depend on the seed
+    and the run number only."""
+
+    experiment: Experiment
+    world: WorldParams
+    filter_params: dict[str, Any]
+    make_scenario: Callable[[Any], Scenario]
+    make_filter: dict[str, Callable]
+    metrics: tuple[Metric, ...]
+    n_steps: int
+
+    @staticmethod
+    def of(experiment: Experiment) -> "Program":
+        """Builds scenario and filters of a checked experiment.
+
+        Raises:
+            DataError: a recording cannot be used.
+        """
+        dtype = jnp.dtype(experiment.monte_carlo.dtype)
+        scenario_params, make_scenario = SCENARIOS.get(experiment.scenario.kind).builder(
+            experiment.scenario, experiment.monte_carlo.runs
+        )
+        model, prior = experiment.model, experiment.model.prior
+        noise = model.process_noise
+        world = WorldParams(
+            scenario_params,
+            TrackingModel(
+                WhiteAcceleration(noise.psd) if noise.kind == "white_acceleration" else FixedNoise.of(noise.cov),
+                Sym2.of(np.array(model.noise_cov)),
+                model.extent_scale,
+            ),
+            Prior(np.array(prior.mean), np.array(prior.cov), Ellipse(np.array(prior.semi_axes), prior.orientation)),
+            np.inf if experiment.divergence is None else experiment.divergence.position_error_above,
+        )
+        built = {label: FILTERS.get(settings.kind).builder(settings) for label, settings in experiment.filters.items()}
+        world = cast(world, dtype)
+        n_steps = jax.eval_shape(lambda p: make_scenario(p).dt, world.scenario).shape[0]
+        return Program(
+            experiment,
+            world,
+            {label: cast(params, dtype) for label, (params, _) in built.items()},
+            make_scenario,
+            {label: make for label, (_, make) in built.items()},
+            tuple(METRICS[name] for name in experiment.metrics),
+            n_steps,
+        )
+
+    def simulate_run(self, world: WorldParams, seed, run) -> Simulation:
+        """Truth and scans of one run."""
+        scenario, key = self.make_scenario(world.scenario), run_key(seed, run)
+        truth = scenario.sample_truth(purpose_key(key, Purpose.TRUTH))
+        return Simulation(truth, scenario.sample_scans(truth, purpose_key(key, Purpose.MEASUREMENTS)))
+
+    def score_run(self, label: str, world, params, seed, run, scans: Measurements, target: Truth) -> Scores:
+        """Scores of one filter in one run."""
+        flt = guarded(self.make_filter[label](params, world.model))
+        tracker = Tracker(flt, world.prior, self.experiment.start_with == "predict")
+        key = filter_key(run_key(seed, run), label)
+        dt = self.make_scenario(world.scenario).dt
+        return score(tracker, self.rules_for(label), target, scans, dt, key, world.position_limit)
+
+    def rules_for(self, label: str) -> Rules:
+        """A reference filter is not compared with itself; it has no metrics."""
+        metrics = () if label == self.experiment.reference else self.metrics
+        return Rules(metrics, self.experiment.skip_steps, self.experiment.traces)
+
+    def simulator(self) -> Callable[..., Simulation]:
+        """Jitted (world, seed, runs) -> Simulation, mapped over runs."""
+        return jax.jit(jax.vmap(self.simulate_run, in_axes=(None, None, 0)))
+
+    def scorer(self, label: str) -> Callable[..., Scores]:
+        """Jitted (world, params, seed, runs, scans, target) -> Scores of one filter, mapped over runs."""
+        return jax.jit(jax.vmap(partial(self.score_run, label), in_axes=(None, None, None, 0, 0, 0)))

@@ -1,0 +1,145 @@
+"""From stored chunks to the summary of an experiment: every metric of every filter with its uncertainty."""
+
+import math
+from collections import Counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emt.status import FAILURE, Status
+from emt.store import RunReader
+
+SUMMARY_FILE = "summary.json"
+
+
+class Curve(NamedTuple):
+    """A metric over time, over the runs without failure."""
+
+    mean: np.ndarray
+    """Mean over runs at each step (of the squared error, for root-mean-square metrics)."""
+    std: np.ndarray
+    """Standard deviation over runs at each step."""
+    runs: int
+
+
+class FilterResults(NamedTuple):
+    """Scores of one filter in all runs, and its sums per step."""
+
+    values: np.ndarray
+    """(run, metric)."""
+    status: np.ndarray
+    failed_step: np.ndarray
+    nis: np.ndarray
+    step_sum: np.ndarray
+    """(block, step, metric)."""
+    step_count: np.ndarray
+    """(block,)."""
+    step_squares: np.ndarray
+    """(step, metric)."""
+
+    @property
+    def sound(self) -> np.ndarray:
+        """True for the runs without a failure bit."""
+        return (self.status & int(FAILURE)) == 0
+
+
+def filter_results(reader: RunReader, label: str) -> FilterResults:
+    """All chunks of one filter, in run order."""
+    names = [f"{label}/{name}" for name in FilterResults._fields]
+    chunks = [reader.read_chunk(chunk, names) for chunk in reader.chunks()]
+    columns = {name: [chunk[f"{label}/{name}"] for chunk in chunks] for name in FilterResults._fields}
+    squares = columns.pop("step_squares")
+    return FilterResults(
+        **{name: np.concatenate(parts) for name, parts in columns.items()}, step_squares=np.sum(squares, axis=0)
+    )
+
+
+def standard_error_of_std(values: np.ndarray) -> float:
+    """Standard error of the sample standard deviation, from the sample's own fourth moment."""
+    n, variance = len(values), float(np.var(values, ddof=1))
+    if variance == 0.0 or n < 4:
+        return math.nan
+    fourth = float(np.mean((values - values.mean()) ** 4))
+    return math.sqrt(max(fourth - variance**2 * (n - 3) / (n - 1), 0.0) / n) / (2.0 * math.sqrt(variance))
+
+
+def rms_over_runs(results: FilterResults, column: int, first_step: int) -> tuple[float, float]:
+    """Root over runs at each step, mean over steps; with a standard error by the jackknife over blocks of runs."""
+    sums, counts = results.step_sum[:, first_step:, column], results.step_count
+    sums, counts = sums[counts > 0], counts[counts > 0]
+    value = float(np.mean(np.sqrt(sums.sum(axis=0) / counts.sum())))
+    if len(counts) < 2:
+        return value, math.nan
+    without = np.mean(np.sqrt((sums.sum(axis=0) - sums) / (counts.sum() - counts)[:, None]), axis=1)
+    blocks = len(counts)
+    return value, float(np.sqrt((blocks - 1) / blocks * np.sum((without - without.mean()) ** 2)))
+
+
+def summarise_metric(metric: dict[str, Any], results: FilterResults, column: int, first_step: int) -> dict[str, Any]:
+    """value, se, std, median and runs_used of one metric; None where the runs do not allow a number."""
+    values = results.values[results.sound, column]
+    n = len(values)
+    std = float(np.std(values, ddof=1)) if n > 1 else math.nan
+    value = se = median = math.nan
+    if n:
+        median = float(np.median(values))
+        match metric["over_runs"]:
+            case "mean":
+                value, se = float(np.mean(values)), std / math.sqrt(n)
+            case "std":
+                value, se = std, standard_error_of_std(values) if n > 1 else math.nan
+            case _:
+                value, se = rms_over_runs(results, column, first_step)
+    numbers = {"value": value, "se": se, "std": std, "median": median}
+    return {k: (v if math.isfinite(v) else None) for k, v in numbers.items()} | {"runs_used": n}
+
+
+def scored_labels(reader: RunReader) -> list[str]:
+    """Filters with metrics, in the order of the configuration: none without metrics, and never the reference."""
+    manifest = reader.manifest
+    reference = manifest["identity"]["config"]["reference"]
+    return [label for label in manifest["filters"] if manifest["metrics"] and label != reference]
+
+
+def summarise(reader: RunReader) -> dict[str, Any]:
+    """The summary of a run folder, as written to `summary.json`."""
+    manifest = reader.manifest
+    identity, metrics = manifest["identity"], manifest["metrics"]
+    first_step = identity["config"]["skip_steps"]
+    runs = max((chunk.stop for chunk in reader.chunks()), default=0)
+    filters, flags = {}, {}
+    for label in scored_labels(reader):
+        results = filter_results(reader, label)
+        filters[label] = {
+            metric["name"]: summarise_metric(metric, results, column, first_step)
+            for column, metric in enumerate(metrics)
+        }
+        names = Counter(name for bits in results.status for name in Status.names_of(int(bits)))
+        failed = ~results.sound
+        flags[label] = {
+            "failed": int(failed.sum()),
+            "failed_runs": [int(run) for run in np.flatnonzero(failed)[:20]],
+            "runs_with": dict(sorted(names.items())),
+            "mean_nis": float(results.nis[results.sound].mean()) if results.sound.any() else None,
+        }
+    return {
+        "experiment": identity["experiment"],
+        "runs": runs,
+        "seed": identity["seed"],
+        "filters": filters,
+        "status": flags,
+        "labels": scored_labels(reader),
+        "metrics": metrics,
+    }
+
+
+def curves(reader: RunReader, label: str) -> dict[str, Curve]:
+    """Every metric of one filter over time; none for a reference filter."""
+    if label not in scored_labels(reader):
+        return {}
+    results = filter_results(reader, label)
+    n = int(results.step_count.sum())
+    mean = results.step_sum.sum(axis=0) / max(n, 1)
+    variance = np.maximum(results.step_squares / max(n, 1) - mean**2, 0.0)
+    names = [metric["name"] for metric in reader.manifest["metrics"]]
+    return {name: Curve(mean[:, k], np.sqrt(variance[:, k]), n) for k, name in enumerate(names)}

@@ -1,0 +1,214 @@
+"""Runs an experiment into a folder: chunk by chunk, resumable, with what the tables and figures need at the end."""
+
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emt.config.errors import ConfigError
+from emt.config.load import Loaded, problem_at
+from emt.device import configure, environment
+from emt.montecarlo.chunks import Engine
+from emt.montecarlo.program import Program
+from emt.reports.estimates import estimates_table
+from emt.reports.figures import over_time_figure, replay_figure, track_figure
+from emt.reports.published import summary_table
+from emt.reports.replay import overview_table, steps_table
+from emt.reports.summary import SUMMARY_FILE, curves, summarise
+from emt.reports.table import Table
+from emt.scenarios.recorded import DataError
+from emt.status import FAILURE
+from emt.store import RunFolder
+
+
+class Progress(NamedTuple):
+    """Where a run stands, for a live display."""
+
+    stage: str
+    """"compiling", "running", "reporting" or "done"."""
+    detail: str
+    done: int
+    """Finished runs, earlier ones included."""
+    total: int
+    runs_per_second: float
+    running: dict[str, tuple[float, float, int]]
+    """Per filter: mean and standard error so far of the first metric, and failed runs."""
+
+
+class Running:
+    """Mean, standard error and failures so far, per filter, of the first metric."""
+
+    def __init__(self):
+        self._sums: dict[str, np.ndarray] = {}
+
+    def add(self, labels: list[str], arrays: dict[str, np.ndarray]) -> None:
+        """Takes in the arrays of a chunk."""
+        for label in labels:
+            values, sound = arrays[f"{label}/values"], (arrays[f"{label}/status"] & int(FAILURE)) == 0
+            if values.shape[1]:
+                kept = values[sound, 0]
+                new = np.array([len(kept), kept.sum(), (kept**2).sum(), (~sound).sum()])
+                self._sums[label] = self._sums.get(label, np.zeros(4)) + new
+
+    def state(self) -> dict[str, tuple[float, float, int]]:
+        """(mean, standard error, failed runs) per filter with a sound run."""
+        result = {}
+        for label, (n, total, squares, failed) in self._sums.items():
+            if n > 0:
+                variance = max(squares / n - (total / n) ** 2, 0.0)
+                result[label] = (total / n, (variance / max(n - 1, 1)) ** 0.5, int(failed))
+        return result
+
+
+def build_program(loaded: Loaded) -> Program:
+    """The compiled form of an experiment, its recording read and checked.
+
+    Raises:
+        ConfigError: the recording cannot be used.
+    """
+    configure()
+    try:
+        return Program.of(loaded.experiment)
+    except DataError as error:
+        raise ConfigError([problem_at(loaded.source, ("scenario", "path"), str(error))]) from error
+
+
+def metric_facts(program: Program) -> list[dict[str, Any]]:
+    """Name, unit, definition and averaging of the metrics, as plain data."""
+    return [{k: v for k, v in m._asdict().items() if k != "per_step"} for m in program.metrics]
+
+
+def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
+    """What is recorded with results: the identity they depend on, and what readers need to show them."""
+    identity, experiment = loaded.identity(), loaded.experiment
+    if not experiment.scenario.has_truth:
+        scans = program.world.scenario
+        digest = hashlib.sha256(np.asarray(scans.points).tobytes() + np.asarray(scans.mask).tobytes())
+        identity["recording_sha256"] = digest.hexdigest()
+    return {
+        "identity": identity,
+        "environment": environment(),
+        "metrics": metric_facts(program),
+        "filters": list(experiment.filters),
+        "paper": experiment.paper,
+        "title": experiment.title,
+        "length_unit": experiment.length_unit,
+        "steps": program.n_steps,
+        "has_truth": experiment.scenario.has_truth,
+    }
+
+
+def run(
+    loaded: Loaded,
+    out: Path,
+    *,
+    runs: int | None = None,
+    more: int = 0,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> dict[str, Any]:
+    """Runs what is missing of an experiment and writes summary, tables and figures; returns the summary.
+
+    Args:
+        out: the run folder; made if missing, continued if it belongs to the same configuration.
+        runs: number of runs wanted in all; by default that of the configuration.
+        more: number of runs to add to those in the folder, instead.
+
+    Raises:
+        ConfigError: the recording cannot be used.
+        StoreError: the folder cannot be used, or belongs to another configuration.
+    """
+    program = build_program(loaded)
+    labels, chunk_size = list(loaded.experiment.filters), loaded.experiment.chunk_size
+    with RunFolder.open(out, manifest_of(loaded, program)) as folder:
+        present = sum(chunk.stop - chunk.start for chunk in folder.chunks())
+        if more:
+            total = max((chunk.stop for chunk in folder.chunks()), default=0) + more
+        else:
+            total = loaded.experiment.monte_carlo.runs if runs is None else runs
+        missing = folder.missing(total, chunk_size)
+        engine = Engine(program, loaded.experiment.monte_carlo.seed, chunk_size)
+        running = Running()
+        for chunk in folder.chunks():
+            running.add(labels, folder.read_chunk(chunk))  # a damaged chunk is found before anything is computed
+        started = time.perf_counter()
+
+        def tell(stage: str, detail: str, done: int, rate: float = 0.0) -> None:
+            on_progress(Progress(stage, detail, done, max(total, done), rate, running.state()))
+
+        timing: dict[str, Any] = {}
+        if missing:
+            names: list[str] = []
+
+            def on_start(name: str) -> None:
+                names.append(name)
+                tell("compiling", ", ".join(names[-2:]), present)
+
+            engine.compile(on_start)
+            timing["compile_seconds"] = time.perf_counter() - started
+        began, done = time.perf_counter(), present
+        for number, (start, stop) in enumerate(missing, start=1):
+            arrays = engine.run_chunk(start, stop)
+            folder.write_chunk(start, stop, arrays)
+            running.add(labels, arrays)
+            done += stop - start
+            elapsed = time.perf_counter() - began
+            tell("running", f"chunk {number}/{len(missing)}", done, (done - present) / elapsed)
+            timing["run_seconds"], timing["runs"] = elapsed, done - present
+        tell("reporting", "tables and figures", done)
+        summary = write_reports(folder, engine if missing else None)
+        if timing:
+            folder.write_json("timing.json", timing)
+        tell("done", "", done)
+    return summary
+
+
+def write_reports(folder: RunFolder, engine: Engine | None) -> dict[str, Any]:
+    """Summary, table and figures of a run folder; the picture of run 0 only where an engine is at hand."""
+    summary = summarise(folder)
+    manifest = folder.manifest
+    unit, metrics = manifest["length_unit"], manifest["metrics"]
+    folder.write_json(SUMMARY_FILE, summary)
+    if metrics:
+        folder.write_text("table.md", summary_table(summary, unit).render("markdown"))
+        scored = {label: curves(folder, label) for label in manifest["filters"]}
+        if manifest["steps"] > 1:
+            folder.write_bytes("over_time.png", over_time_figure(scored, metrics, length_unit=unit))
+    if manifest["identity"]["config"]["traces"]:
+        folder.write_text("estimates.csv", estimates_table(folder).render("csv"))
+    if engine is not None:
+        arrays = engine.run_chunk(0, 1, tracks=True)
+        title = f"{manifest['title'] or summary['experiment']}: run 0"
+        folder.write_bytes("track.png", track_figure(arrays, manifest["filters"], length_unit=unit, title=title))
+    return summary
+
+
+class Replay(NamedTuple):
+    """One run computed again."""
+
+    figure: bytes
+    """PNG of truth, scans and ellipses, with the metrics over time."""
+    steps: Table
+    """Every filter's report and metrics at every step."""
+    overview: Table
+    """Metrics, flags and first failed step per filter."""
+
+
+def replay(loaded: Loaded, run: int) -> Replay:
+    """Computes one run again, with every step of every filter.
+
+    Raises:
+        ConfigError: the recording cannot be used.
+    """
+    program = build_program(loaded)
+    engine = Engine(program, loaded.experiment.monte_carlo.seed, loaded.experiment.chunk_size)
+    engine.compile()
+    start = run - run % engine.chunk_size  # the chunk the run would belong to, so that the same lanes compute it
+    arrays = {name: values[run - start :] for name, values in engine.run_chunk(start, run + 1, tracks=True).items()}
+    metrics = metric_facts(program)
+    labels, unit = list(loaded.experiment.filters), loaded.experiment.length_unit
+    title = f"{loaded.experiment.title or loaded.name}: run {run}"
+    figure = replay_figure(arrays, labels, metrics, length_unit=unit, title=title)
+    return Replay(figure, steps_table(arrays, labels, metrics), overview_table(arrays, labels, metrics, title, unit))

@@ -19,7 +19,7 @@ _PUBLIC = {
     "replay": "emt.runner",
     "run": "emt.runner",
 }
-__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__all__ = sorted(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

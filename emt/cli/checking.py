@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from emt.cli.errors import CHECK_FAILED, UNUSABLE, Unusable, say
+from emt.cli.errors import CHECK_FAILED, UNUSABLE, UnusableError, say
 
 
 def verify(
@@ -91,7 +91,7 @@ def check(
     try:
         stored = {} if update else {name: read_baseline(path) for name, path in paths.items()}
     except BaselineError as error:
-        raise Unusable(str(error)) from error
+        raise UnusableError(str(error)) from error
     changes = []
     with tempfile.TemporaryDirectory() as scratch:
         for item in loaded:

@@ -12,11 +12,11 @@ CHECK_FAILED = 1
 UNUSABLE = 2
 
 
-class Unusable(Exception):
+class UnusableError(Exception):
     """Something the user must change before the command can run; the text says what and how."""
 
 
-class Interrupted(Exception):
+class InterruptedRunError(Exception):
     """Stopped by the user; the text says what is kept and how to go on."""
 
 
@@ -31,7 +31,7 @@ def expected_errors() -> tuple[type[Exception], ...]:
     from emt.registry import PluginError, UnknownName
     from emt.store import StoreError
 
-    found: list[type[Exception]] = [Unusable, ConfigError, StoreError, PluginError, UnknownName]
+    found: list[type[Exception]] = [UnusableError, ConfigError, StoreError, PluginError, UnknownName]
     if "emt.conformance.golden" in sys.modules:
         from emt.conformance.golden import GoldenError
 
@@ -49,7 +49,7 @@ def run_app(app: Callable[..., object], debug: bool) -> int:
     except click.ClickException as error:
         error.show()
         return UNUSABLE
-    except Interrupted as error:
+    except InterruptedRunError as error:
         say(str(error))
         return CHECK_FAILED
     except (KeyboardInterrupt, click.Abort):

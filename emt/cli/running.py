@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from emt.cli.errors import Interrupted, Unusable, say
+from emt.cli.errors import InterruptedRunError, UnusableError, say
 
 
 class TableFormat(StrEnum):
@@ -87,7 +87,7 @@ def run_shown(loaded, folder: Path, *, more: int = 0, runs: int | None = None):
             return run_experiment(loaded, folder, runs=runs, more=more, on_progress=update)
     except KeyboardInterrupt:
         kept = f"{last.done} of {last.total}" if last is not None else "all finished"
-        raise Interrupted(f"interrupted: {kept} runs are kept in {folder}; the same command continues") from None
+        raise InterruptedRunError(f"interrupted: {kept} runs are kept in {folder}; the same command continues") from None
 
 
 def reproduce(
@@ -104,7 +104,8 @@ def reproduce(
     Example: emt reproduce tuncer2021 --scale smoke
     """
     from emt.config.load import load_experiment
-    from emt.config.shipped import config_names, papers as shipped_papers
+    from emt.config.shipped import config_names
+    from emt.config.shipped import papers as shipped_papers
     from emt.registry import suggest
     from emt.reports.paper import paper_report
 
@@ -113,7 +114,7 @@ def reproduce(
         if paper not in shipped_papers():
             near = suggest(paper, shipped_papers())
             hint = f" (did you mean '{near}'?)" if near else ""
-            raise Unusable(f"unknown paper '{paper}'{hint}; known: {', '.join(shipped_papers())}")
+            raise UnusableError(f"unknown paper '{paper}'{hint}; known: {', '.join(shipped_papers())}")
     out = Path("results") / f"reproduce-{scale}" if out is None else out
     loaded = [load_experiment(name) for paper in wanted for name in config_names(paper)]
     recordings = find_recordings(loaded, data or [])
@@ -147,7 +148,7 @@ def find_recordings(loaded, places: list[Path]) -> dict[str, Path]:
     found = {}
     for place in places:
         if not place.exists():
-            raise Unusable(f"--data {place}: there is no such file or folder")
+            raise UnusableError(f"--data {place}: there is no such file or folder")
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             if path.is_file() and path.suffix.lower() in (".mat", ".csv"):
                 digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -193,6 +194,6 @@ def replay(
         (folder / f"{stem}.png").write_bytes(result.figure)
         (folder / f"{stem}.csv").write_text(result.steps.render("csv"), encoding="utf-8")
     except OSError as error:
-        raise Unusable(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise UnusableError(f"{folder}: cannot be written: {error.strerror or error}") from error
     typer.echo(result.overview.render("text"), nl=False)
     say(f"figure: {folder / f'{stem}.png'}\nvalues: {folder / f'{stem}.csv'}")

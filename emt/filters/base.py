@@ -1,4 +1,4 @@
-"""What every filter shares: the model it is told, the door that screens scans, and the guard that keeps states sound."""
+"""What filters share: the model they are told, the door that screens scans, and the guard of their states."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,5 +1,6 @@
 """Many runs: chunks of fixed size, from run numbers to the arrays that are stored."""
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -32,7 +33,7 @@ def score_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
     sound = (status & int(FAILURE)) == 0
     kept = np.where(sound[:, None, None], rows, 0.0)
     edges = np.linspace(0, n, BLOCKS + 1).astype(int)
-    blocks = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
     return {
         f"{label}/values": np.asarray(scores.values)[:n].astype(np.float64),
         f"{label}/status": status.astype(np.int32),

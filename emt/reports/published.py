@@ -1,15 +1,16 @@
 """Published numbers beside ours: verdicts from our interval and the printed precision."""
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
+
+from pydantic import PositiveInt
 
 from emt.config.errors import validate
 from emt.config.source import load_source
 from emt.reports.numbers import unit_text, value_and_error
 from emt.reports.table import Column, Table
-from pydantic import PositiveInt
-
 from emt.settings import Settings
 
 Verdict = Literal["agrees", "close", "differs", "not comparable"]
@@ -178,7 +179,7 @@ def claim_verdict(claim: Claim, summary: dict[str, Any]) -> tuple[str, str]:
         return "not comparable", ""
     numbers = " < ".join(value_and_error(o["value"], o["se"])[0] for o in ours)
     verdict = "holds"
-    for low, high in zip(ours[:-1], ours[1:], strict=True):
+    for low, high in itertools.pairwise(ours):
         gap, error = high["value"] - low["value"], 1.96 * math.hypot(low["se"] or 0.0, high["se"] or 0.0)
         if gap < -error:
             return "does not hold", numbers.replace("<", "/")

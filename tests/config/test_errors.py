@@ -3,7 +3,7 @@
 from typing import Annotated, Any, Literal
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import AfterValidator, Field, PositiveInt, Tag, field_validator, model_validator
 from pydantic.types import Discriminator
@@ -263,6 +263,7 @@ VALUES = st.recursive(
 )
 
 
+@settings(max_examples=50)
 @given(st.dictionaries(st.sampled_from([*Experiment.model_fields, "other"]), VALUES, max_size=4))
 def test_any_data_is_valid_or_a_config_error(data):
     source = parse_source("a: 1", "c.yaml")

@@ -270,7 +270,7 @@ YAML_BITS = st.lists(
 ).map("".join)  # fmt: skip
 
 
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.one_of(YAML_BITS, YAML_BITS.map("a: ".__add__), st.text(max_size=60)))
 @example('"\\UFFFFFFFF"')
 @example("%YAML 1.x\n---\na: 1")

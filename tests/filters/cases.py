@@ -126,7 +126,7 @@ def track(case: Case, problem: Problem, guard: bool = True) -> tuple[Estimate, I
     return jax.lax.scan(step, flt.init(problem.prior, key), (problem.scans, problem.dt))[1]
 
 
-FAST_COMPILE = {"xla_backend_optimization_level": 0}
+FAST_COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 """For programs that run once: compiling takes longer than running."""
 
 

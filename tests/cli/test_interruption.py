@@ -1,0 +1,76 @@
+"""Killed or interrupted at any moment, a run loses at most the chunk in flight and ends with the same bytes."""
+
+import random
+import signal
+import time
+
+import pytest
+
+from tests.cli.run_emt import start_emt
+from tests.montecarlo.small import TEXT, write
+
+# many small chunks, so that moments fall within, between and after them
+MANY = TEXT.replace("runs: 40", "runs: 1280")
+
+
+def results(folder):
+    """Every file whose bytes follow from the configuration alone."""
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix in (".npz", ".md", ".png") or p.name == "summary.json"}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """(configuration, compilation cache, results) of a run that nobody disturbed."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    config, cache = write(folder, MANY), folder / "cache"
+    process = start_emt("run", config, "--out", folder / "out", cwd=folder, cache=cache)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, out + err
+    return config, cache, results(folder / "out")
+
+
+def wait_for_chunks(folder, count, process):
+    """Waits until the run has written this many chunks."""
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob("chunk-*.npz"))) < count:
+        assert time.monotonic() < deadline
+        if process.poll() is not None:
+            return
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT], ids=["kill -9", "Ctrl-C"])
+def test_the_same_command_continues_and_ends_with_the_same_bytes(tmp_path, undisturbed, stop):
+    config, cache, expected = undisturbed
+    out, moments = tmp_path / "out", random.Random(int(stop))
+    chunks = sorted(moments.sample(range(1, 70), 3))
+    for count in chunks:
+        process = start_emt("run", config, "--out", out, cwd=tmp_path, cache=cache)
+        wait_for_chunks(out, count, process)
+        time.sleep(moments.uniform(0.0, 0.01))
+        before = {p.name for p in out.glob("chunk-*.npz")}
+        process.send_signal(stop)
+        _, err = process.communicate(timeout=60)
+        assert before <= {p.name for p in out.glob("chunk-*.npz")}
+        if stop == signal.SIGINT and process.returncode != 0:
+            assert process.returncode == 1
+            assert "interrupted" in err
+            assert "the same command continues" in err
+    process = start_emt("run", config, "--out", out, cwd=tmp_path, cache=cache)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    assert results(out) == expected
+
+
+def test_a_second_process_in_the_same_folder_is_refused(tmp_path, undisturbed):
+    config, cache, _ = undisturbed
+    out = tmp_path / "out"
+    first = start_emt("run", config, "--out", out, cwd=tmp_path, cache=cache)
+    wait_for_chunks(out, 1, first)
+    second = start_emt("run", config, "--out", out, cwd=tmp_path, cache=cache)
+    _, err = second.communicate(timeout=60)
+    if first.poll() is None:  # the first was still at work
+        assert second.returncode == 2
+        assert str(first.pid) in err
+    first.communicate(timeout=300)
+    assert first.returncode == 0

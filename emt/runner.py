@@ -11,7 +11,7 @@ import numpy as np
 from emt.config.errors import ConfigError
 from emt.config.load import Loaded, problem_at
 from emt.device import configure, environment
-from emt.montecarlo.chunks import Engine
+from emt.montecarlo.chunks import Engine, without_tracks
 from emt.montecarlo.program import Program
 from emt.reports.estimates import estimates_table
 from emt.reports.figures import over_time_figure, replay_figure, track_figure
@@ -22,6 +22,9 @@ from emt.reports.table import Table
 from emt.scenarios.recorded import DataError
 from emt.status import FAILURE
 from emt.store import RunFolder
+
+
+TRACK_FIGURE = "track.png"
 
 
 class Progress(NamedTuple):
@@ -139,6 +142,7 @@ def run(
             on_progress(Progress(stage, detail, done, max(total, done), rate, running.state()))
 
         timing: dict[str, Any] = {}
+        first_run: dict[str, np.ndarray] = {}
         if missing:
             names: list[str] = []
 
@@ -149,8 +153,11 @@ def run(
             engine.compile(on_start)
             timing["compile_seconds"] = time.perf_counter() - started
         began, done = time.perf_counter(), present
-        for number, (start, stop) in enumerate(missing, start=1):
-            arrays = engine.run_chunk(start, stop)
+        for number, (start, stop, arrays) in enumerate(engine.run_chunks(missing), start=1):
+            if start == 0:
+                first_run = {name: array[:1] for name, array in arrays.items()}
+            if not loaded.experiment.traces:
+                arrays = without_tracks(arrays)
             folder.write_chunk(start, stop, arrays)
             running.add(labels, arrays)
             done += stop - start
@@ -158,30 +165,32 @@ def run(
             tell("running", f"chunk {number}/{len(missing)}", done, (done - present) / elapsed)
             timing["run_seconds"], timing["runs"] = elapsed, done - present
         tell("reporting", "tables and figures", done)
-        summary = write_reports(folder, engine if missing else None)
+        if not first_run and not (folder.path / TRACK_FIGURE).exists():
+            engine.compile()
+            first_run = engine.run_chunk(0, 1, tracks=True)
+        summary = write_reports(folder, first_run)
         if timing:
             folder.write_json("timing.json", timing)
         tell("done", "", done)
     return summary
 
 
-def write_reports(folder: RunFolder, engine: Engine | None) -> dict[str, Any]:
-    """Summary, table and figures of a run folder; the picture of run 0 only where an engine is at hand."""
+def write_reports(folder: RunFolder, first_run: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Summary, table and figures of a run folder; the picture of run 0 where its tracks are at hand."""
     summary = summarise(folder)
     manifest = folder.manifest
-    unit, metrics = manifest["length_unit"], manifest["metrics"]
+    unit, metrics, labels = manifest["length_unit"], manifest["metrics"], manifest["filters"]
     folder.write_json(SUMMARY_FILE, summary)
     if metrics:
         folder.write_text("table.md", summary_table(summary, unit).render("markdown"))
-        scored = {label: curves(folder, label) for label in manifest["filters"]}
         if manifest["steps"] > 1:
+            scored = {label: curves(folder, label) for label in labels}
             folder.write_bytes("over_time.png", over_time_figure(scored, metrics, length_unit=unit))
     if manifest["identity"]["config"]["traces"]:
         folder.write_text("estimates.csv", estimates_table(folder).render("csv"))
-    if engine is not None:
-        arrays = engine.run_chunk(0, 1, tracks=True)
+    if first_run:
         title = f"{manifest['title'] or summary['experiment']}: run 0"
-        folder.write_bytes("track.png", track_figure(arrays, manifest["filters"], length_unit=unit, title=title))
+        folder.write_bytes(TRACK_FIGURE, track_figure(first_run, labels, length_unit=unit, title=title))
     return summary
 
 

@@ -251,6 +251,7 @@ def compare_gp_ett(content: dict) -> Iterator[Quantity]:
                     0.0,
                     motion["std_psi"] ** 2,
                     motion["forgetting_alpha"],
+                    0.0,
                 )
             )
         )

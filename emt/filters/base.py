@@ -78,7 +78,7 @@ def innovation_info(position: Vec2, position_cov: Sym2, spread: Sym2, scan: Meas
     weight = (position_cov + spread).inverse()
     dx, dy = scan.points[:, 0] - position.x, scan.points[:, 1] - position.y
     distances = weight.xx * dx * dx + 2.0 * weight.xy * dx * dy + weight.yy * dy * dy
-    gross = (scan.mask & (distances > GROSS_INNOVATION**2)).any()
+    gross = (scan.mask & ~(distances <= GROSS_INNOVATION**2)).any()  # also where the distance is not a number
     return Info(
         log_likelihood=jnp.where(seen, log_likelihood, 0.0),
         nis=jnp.where(seen, nis, 0.0),
@@ -145,6 +145,7 @@ def guarded(flt: Filter) -> Filter:
         status = status | jnp.where(skipped, int(Status.MEASUREMENT_SKIPPED), 0)
         status = status | jnp.where(scan.overflow, int(Status.SCAN_OVERFLOW), 0)
         finite = jnp.isfinite(info.log_likelihood) & jnp.isfinite(info.nis)
+        status = status | jnp.where(finite, 0, int(Status.FLOOR_USED))
         return Guarded(state, state), Info(
             jnp.where(finite, info.log_likelihood, 0.0), jnp.where(finite, info.nis, 0.0), status
         )

@@ -15,18 +15,24 @@ from emt.linalg import Sym2, Vec2
 from emt.registry import FILTERS
 from emt.settings import (
     AngleVariance,
+    LengthVariance,
     NonNegativeFloat,
     PositiveAngle,
     PositiveAngleVariance,
     PositiveLength,
     Settings,
 )
+from emt.status import Status
 from emt.types import Estimate, Filter, Measurements, Prior, Scalar, StarConvex
 
 N_MOTION = 6
 """State entries before the radii: centre (2), orientation, velocity (2), turn rate."""
 JITTER = 1e-6
 """Added to the diagonal of the radii's covariance before it is inverted, as in the authors' code (m²)."""
+
+
+ROUNDING_FLOOR = 100.0
+"""Units of rounding by which the noise of a point is raised, relative to the predicted spread."""
 
 
 class GpEttSettings(Settings):
@@ -49,6 +55,8 @@ class GpEttSettings(Settings):
     """Power spectral density of the angular acceleration (rad²/s³)."""
     forgetting_rate: NonNegativeFloat = 1e-4
     """Rate at which the radii return to zero mean (1/s)."""
+    outline_variance: LengthVariance = 0.0
+    """Variance, on each axis, of a point about the outline besides the sensor noise: for points from the surface."""
 
 
 @register_dataclass
@@ -63,6 +71,7 @@ class Params:
     turn_rate_variance: Scalar
     turn_acceleration_psd: Scalar
     forgetting_rate: Scalar
+    outline_variance: Scalar
 
 
 class GpState(NamedTuple):
@@ -124,9 +133,10 @@ def measurement(mean, point: Vec2, gp: Contour, model: TrackingModel, params: Pa
     Source: Wahlström and Özkan 2015, eqs. 22-29 and appendix.
     """
     d = jnp.stack([point.x - mean[0], point.y - mean[1]])
-    distance = jnp.sqrt(d @ d)
-    safe = jnp.where(distance > 0.0, distance, 1.0)
-    o = jnp.where(distance > 0.0, d / safe, jnp.array([1.0, 0.0], d.dtype))
+    squared = d @ d
+    # chosen before the root, whose slope at zero is infinite
+    safe = jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0))
+    o = jnp.where(squared > 0.0, d / safe, jnp.array([1.0, 0.0], d.dtype))
     angle = jnp.arctan2(o[1], o[0]) - mean[2]
     row = kernel(angle, gp.angles, params)
     weights = gp.inverse @ row
@@ -140,12 +150,23 @@ def measurement(mean, point: Vec2, gp: Contour, model: TrackingModel, params: Pa
         [by_centre, -radius_slope * o[:, None], jnp.zeros((2, 3), d.dtype), jnp.outer(o, weights)], axis=1
     )
     residual_var = kernel(angle, angle, params) - row @ weights
-    return mean[:2] + radius * o, jacobian, model.sensor_noise.array() + residual_var * jnp.outer(o, o)
+    noise = model.sensor_noise.array() + params.outline_variance * jnp.eye(2, dtype=d.dtype)
+    return mean[:2] + radius * o, jacobian, noise + residual_var * jnp.outer(o, o)
+
+
+def noise_floor(h: Float[Array, "n n_state"], cov: Float[Array, "n_state n_state"]) -> Scalar:
+    """Rounding error of the predicted spread of the points (m²)."""
+    return ROUNDING_FLOOR * jnp.finfo(cov.dtype).eps * ((h @ cov) * h).sum(axis=1).max()
 
 
 def update(state: GpState, scan: Measurements, gp: Contour, model: TrackingModel, params: Params) -> GpState:
-    """One extended Kalman update with all points of the scan, in Joseph form."""
-    n_points = scan.mask.shape[0]
+    """One extended Kalman update with all points of the scan, in Joseph form.
+
+    Deviation from the paper: the noise of a point is raised by the rounding error of the innovation covariance, without
+    which this has no Cholesky factor when the sensor noise is far smaller than the prediction's uncertainty.
+    """
+    n_points, real = scan.mask.shape[0], scan.mask[:, None]
+    # padding sits at the centre, where `measurement` and its derivatives are finite
     expected, jacobian, noise = jax.vmap(lambda point: measurement(state.mean, Vec2.of(point), gp, model, params))(
         scan.points
     )
@@ -154,6 +175,7 @@ def update(state: GpState, scan: Measurements, gp: Contour, model: TrackingModel
     # padding rows: no information (zero Jacobian), unit noise
     h = jnp.where(real[:, :, None], jacobian, 0.0).reshape(2 * n_points, -1)
     r = jax.scipy.linalg.block_diag(*jnp.where(real[:, :, None], noise, jnp.eye(2, dtype=noise.dtype)))
+    r = r + noise_floor(h, state.cov) * jnp.eye(2 * n_points, dtype=r.dtype)
     innovation_cov = symmetrise(h @ state.cov @ h.T + r)
     gain = cho_solve(cho_factor(innovation_cov, lower=True), h @ state.cov).T
     rest = jnp.eye(state.mean.shape[0], dtype=state.mean.dtype) - gain @ h
@@ -190,7 +212,10 @@ def gp_ett(basis_angles: int, params: Params, model: TrackingModel) -> Filter:
         spread_var = model.extent_scale * jnp.mean(radii**2)
         spread = Sym2(spread_var, jnp.zeros_like(spread_var), spread_var) + model.sensor_noise
         info = innovation_info(Vec2.of(state.mean), Sym2.of(state.cov[:2, :2]), spread, scan)
-        return update(state, scan, gp, model, params), info
+        rounding = ROUNDING_FLOOR * jnp.finfo(dtype).eps * (state.cov[0, 0] + state.cov[1, 1])
+        floored = scan.mask.any() & (model.sensor_noise.eigen()[1] < rounding)
+        status = info.status | jnp.where(floored, int(Status.FLOOR_USED), 0)
+        return update(state, scan, gp, model, params), info._replace(status=status)
 
     def estimate(state: GpState) -> Estimate:
         return Estimate(
@@ -212,6 +237,7 @@ def build(settings: GpEttSettings):
         settings.turn_rate_variance,
         settings.turn_acceleration_psd,
         settings.forgetting_rate,
+        settings.outline_variance,
     )
     n = settings.basis_angles
     return params, lambda params, model: gp_ett(n, params, model)

@@ -162,7 +162,8 @@ def mem_ekf_star(params: Params, model: TrackingModel) -> Filter:
         spread = axes.congruence(extent_spread(state, model.extent_scale)) + model.sensor_noise
         info = innovation_info(state.kinematics.position, state.kinematics.position_cov, spread, scan)
         new = update(state, scan, model)
-        crossed = (new.semi_axes.x <= 0.0) | (new.semi_axes.y <= 0.0)
+        a, b = new.semi_axes.x, new.semi_axes.y
+        crossed = (a <= THINNEST * jnp.abs(b)) | (b <= THINNEST * jnp.abs(a))
         status = info.status | jnp.where(crossed, int(Status.FLOOR_USED), 0)
         return new, info._replace(status=status)
 

@@ -1,7 +1,8 @@
 """Many runs: chunks of fixed size, from run numbers to the arrays that are stored."""
 
 import itertools
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -13,6 +14,8 @@ from emt.montecarlo.program import Program, Simulation
 from emt.montecarlo.run import Scores, as_truth
 from emt.status import FAILURE
 
+WORKERS = 2
+"""Chunks in work at a time."""
 BLOCKS = 8
 """Groups of runs per chunk whose sums per step are kept apart, for standard errors of root-mean-square metrics."""
 
@@ -78,7 +81,9 @@ class Engine:
         return sorted(labels, key=lambda label: label != reference)
 
     def compile(self, on_start: Callable[[str], None] = lambda name: None) -> None:
-        """Compiles simulator and filters, two at a time."""
+        """Compiles simulator and filters, two at a time; again is free."""
+        if self._compiled:
+            return
         program, runs = self.program, jnp.zeros(self.chunk_size, int)
         simulator = program.simulator()
         shapes = jax.eval_shape(simulator, program.world, self.seed, runs)
@@ -91,7 +96,7 @@ class Engine:
             return program.scorer(name).lower(*arguments).compile()
 
         names = ["", *self.labels()]
-        with ThreadPoolExecutor(2) as pool:
+        with ThreadPoolExecutor(WORKERS) as pool:
             self._compiled = dict(zip(names, pool.map(build, names), strict=True))
 
     def run_chunk(self, start: int, stop: int, *, tracks: bool = False) -> dict[str, np.ndarray]:
@@ -112,3 +117,32 @@ class Engine:
         if tracks or experiment.traces:
             arrays |= scan_arrays(simulation, experiment.scenario.has_truth, n)
         return arrays
+
+    def run_chunks(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+        """(start, stop, arrays) of several chunks in order, two of them in work at a time; run 0 comes with tracks.
+
+        Two chunks on two cores take less time than each of them spread over both.
+        """
+        with ThreadPoolExecutor(WORKERS) as pool:
+            waiting: deque = deque()
+            try:
+                for start, stop in ranges:
+                    waiting.append((start, stop, pool.submit(self.run_chunk, start, stop, tracks=start == 0)))
+                    if len(waiting) > WORKERS:
+                        first, last, future = waiting.popleft()
+                        yield first, last, future.result()
+                while waiting:
+                    first, last, future = waiting.popleft()
+                    yield first, last, future.result()
+            finally:
+                for _, _, future in waiting:
+                    future.cancel()
+
+
+def without_tracks(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays that are stored of a chunk unless every report is asked for."""
+    return {
+        name: array
+        for name, array in arrays.items()
+        if "/track/" not in name and not name.startswith(("scans/", "truth/"))
+    }

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field, NonNegativeInt, PositiveInt
 from scipy.stats import poisson
 
@@ -82,7 +82,7 @@ def params_of(settings: DetectionSettings) -> DetectionParams:
     return DetectionParams(mean, Mat2(l11, 0.0, l21, math.sqrt(max(d - l21 * l21, 0.0))))
 
 
-def poisson_count(key: PRNGKeyArray, mean: Scalar, capacity: int) -> tuple[Scalar, Scalar]:
+def poisson_count(key: PRNGKeyArray, mean: Scalar, capacity: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """A Poisson number by inversion of its distribution function, up to `capacity`; and whether it was larger.
 
     Inversion uses one uniform whatever the mean, so the number does not depend on batching or capacity.

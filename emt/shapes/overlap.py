@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 # Newton steps for the cubic. A triple root converges linearly (residual times 0.3 per step), hence so many.
 _CUBIC_STEPS = 36
@@ -208,7 +208,7 @@ def _solve_cubic(alpha: Array, beta: Array, gamma: Array, delta: Array) -> Array
     from_left = ((at_bend < 0.0) & (bend > 0.0)) | (bend >= 0.5)
     start = jnp.where(from_left, 0.0, 0.5).astype(alpha.dtype)
 
-    def step(_: int, w: Array) -> Array:
+    def step(_: Int[Array, ""], w: Array) -> Array:
         value = ((k3 * w + k2) * w + k1) * w + k0
         slope = (3.0 * k3 * w + 2.0 * k2) * w + k1
         # From the right the chord to the inflection bounds the root; it keeps tiny roots relatively exact.

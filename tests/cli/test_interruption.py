@@ -43,10 +43,10 @@ def wait_for_chunks(folder, count, process):
 def test_the_same_command_continues_and_ends_with_the_same_bytes(tmp_path, undisturbed, stop):
     config, cache, expected = undisturbed
     out, moments = tmp_path / "out", random.Random(int(stop))
-    chunks = sorted(moments.sample(range(1, 70), 3))
-    for count in chunks:
+    for _ in range(3):
+        present = len(list(out.glob("chunk-*.npz")))
         process = start_emt("run", config, "--out", out, cwd=tmp_path, cache=cache)
-        wait_for_chunks(out, count, process)
+        wait_for_chunks(out, present + moments.randint(1, 20), process)
         time.sleep(moments.uniform(0.0, 0.01))
         before = {p.name for p in out.glob("chunk-*.npz")}
         process.send_signal(stop)

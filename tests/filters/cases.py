@@ -68,12 +68,10 @@ class Case:
     """The order of the points of a scan does not matter."""
     turns: bool = True
     """Turning the world turns the answer by any angle; if not, by half a turn at least."""
-    exact_given_shape: bool = True
-    """With the shape known and little sensor noise the filter is a Kalman filter of the position."""
     unwrapped: bool = True
     """The orientation is a state, not read from a matrix."""
-    unit_tolerance: float = 1e-9
-    """Relative change under other units."""
+    any_length_unit: bool = True
+    """No constant of the filter is a length."""
     known_shape: Settings | None = None
     """Settings under which the prior shape is taken as the truth."""
 
@@ -138,8 +136,8 @@ def tracker(case: Case, guard: bool = True):
 
 @cache
 def batch_tracker(case: Case):
-    """Jitted `track` of problems with a leading axis, compiled as in experiments."""
-    return jax.jit(jax.vmap(partial(track, case)))
+    """Jitted `track` of problems with a leading axis."""
+    return jax.jit(jax.vmap(partial(track, case)), compiler_options=FAST_COMPILE)
 
 
 def extent_matrices(semi_axes, orientation):
@@ -359,6 +357,7 @@ def _gp_units(params, length, time):
         params.turn_rate_variance / time**2,
         params.turn_acceleration_psd / time**3,
         params.forgetting_rate / time,
+        length**2 * params.outline_variance,
     )
 
 
@@ -397,8 +396,7 @@ CASES = [
     _feldmann("feldmann_weight", {"kind": "weight", "factor": 0.9}, "major_axis"),
     _feldmann("feldmann_inverse_wishart", {"kind": "inverse_wishart", "factor": 0.97}, "first_quadrant"),
     Case(
-        "gp_ett", GP, gp_oracle, _gp_units, tolerance=1e-6, source="outline", exact_given_shape=False,
-        unit_tolerance=1e-3,
+        "gp_ett", GP, gp_oracle, _gp_units, tolerance=1e-6, source="outline", any_length_unit=False,
     ),
 ]  # fmt: skip
 """One row per filter and rule; see `Case`."""

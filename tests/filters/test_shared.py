@@ -57,6 +57,14 @@ def test_agrees_with_its_oracle(case):
         assert_same(case, Report(*(field[run] for field in ours)), theirs, case.tolerance)
 
 
+@pytest.mark.slow
+@every
+def test_agrees_with_its_oracle_as_compiled_in_experiments(case):
+    """The other tests compile without optimisation, which is faster."""
+    ours = report(jax.jit(jax.vmap(lambda problem: track(case, problem)))(problems(case))[0])
+    assert_same(case, ours, report(solved(case)[0]), case.tolerance)
+
+
 @every
 def test_reports_no_failure_on_ordinary_data(case):
     status = np.asarray(solved(case)[1].status)
@@ -179,8 +187,11 @@ def test_moving_the_origin_moves_the_answer(case):
 
 @every
 def test_other_units_change_only_the_numbers(case):
-    """Lengths and times in other units give the same answer in these units."""
-    length, time = 7.3, 0.19
+    """Lengths and times in other units give the same answer in these units.
+
+    Times only for `gp_ett`, as in its authors' code the jitter on the kernel matrix is 1e-6 in whatever unit.
+    """
+    length, time = 7.3 if case.any_length_unit else 1.0, 0.19
     given, model = problems(case), problems(case).model
     unit = np.array([length, length, length / time, length / time])
     prior = Prior(
@@ -196,7 +207,7 @@ def test_other_units_change_only_the_numbers(case):
     found = answer(case, changed)
     outline = length if case.source == "outline" else length**2
     back = Report(found.mean / unit, found.cov / np.outer(unit, unit), found.outline / outline, found.orientation)
-    assert_same(case, back, report(solved(case)[0]), case.unit_tolerance)
+    assert_same(case, back, report(solved(case)[0]), case.tolerance)
 
 
 @every

@@ -83,12 +83,12 @@ def test_sums_per_step_are_those_of_the_tracks():
 
 
 def test_divergence_takes_a_run_out_and_says_when():
-    strict = engine("divergence={position_error_above: 0.6}")
+    strict = engine("divergence={position_error_above: 1.5}")
     arrays = strict.run_chunk(0, 16, tracks=True)
     lost = (arrays["feldmann/status"] & Status.DIVERGED) != 0
     assert 0 < lost.sum() < 16
     track, truth = arrays["feldmann/track/mean"][..., :2], arrays["truth/position"]
-    beyond = np.linalg.norm(track - truth, axis=-1) > 0.6
+    beyond = np.linalg.norm(track - truth, axis=-1) > 1.5
     np.testing.assert_array_equal(beyond.any(axis=1), lost)
     np.testing.assert_array_equal(arrays["feldmann/failed_step"], np.where(lost, beyond.argmax(axis=1), -1))
     assert arrays["feldmann/step_count"].sum() == 16 - lost.sum()
@@ -109,7 +109,6 @@ def test_start_with_a_prediction_differs_from_start_with_an_update():
 
 def test_single_precision_agrees_with_double():
     single = engine("monte_carlo.dtype=float32").run_chunk(0, 16)
-    assert single["feldmann/track/mean" if "feldmann/track/mean" in single else "feldmann/values"].dtype == np.float64
     # other draws, the same distribution: compare means within their spread
     ours, theirs = values(engine().run_chunk(0, 16))[:, 0], values(single)[:, 0]
     spread = np.hypot(ours.std() / 4, theirs.std() / 4)

@@ -7,7 +7,7 @@ readable because the closed forms have names. Symmetric matrices hold their tria
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -87,8 +87,12 @@ class Mat2:
     def __rmul__(self, scale: Real) -> "Mat2":
         return Mat2(scale * self.xx, scale * self.xy, scale * self.yx, scale * self.yy)
 
-    def __matmul__(self, other):
-        """Product with a Vec2, Mat2 or Sym2."""
+    @overload
+    def __matmul__(self, other: Vec2) -> Vec2: ...
+    @overload
+    def __matmul__(self, other: "Mat2 | Sym2") -> "Mat2": ...
+    def __matmul__(self, other: "Vec2 | Mat2 | Sym2") -> "Vec2 | Mat2":
+        """Product with a vector or a matrix."""
         if isinstance(other, Vec2):
             return Vec2(self.xx * other.x + self.xy * other.y, self.yx * other.x + self.yy * other.y)
         b = other.full() if isinstance(other, Sym2) else other
@@ -146,8 +150,12 @@ class Sym2:
     def __rmul__(self, scale: Real) -> "Sym2":
         return Sym2(scale * self.xx, scale * self.xy, scale * self.yy)
 
-    def __matmul__(self, other):
-        """Product with a Vec2, Mat2 or Sym2."""
+    @overload
+    def __matmul__(self, other: Vec2) -> Vec2: ...
+    @overload
+    def __matmul__(self, other: "Mat2 | Sym2") -> Mat2: ...
+    def __matmul__(self, other: "Vec2 | Mat2 | Sym2") -> Vec2 | Mat2:
+        """Product with a vector or a matrix."""
         return self.full() @ other
 
     def trace(self) -> Real:

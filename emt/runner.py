@@ -23,7 +23,6 @@ from emt.scenarios.recorded import DataError
 from emt.status import FAILURE
 from emt.store import RunFolder
 
-
 TRACK_FIGURE = "track.png"
 
 

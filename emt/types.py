@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 Scalar = Float[Array, ""]
+Traced = Any
+"""A number of the settings: a plain float where parameters are built, an array of shape () inside compiled code."""
 State = Any
 """A filter's own state: any pytree of arrays."""
 

@@ -23,7 +23,8 @@ def check_functions(fn):
 
 
 install_import_hook(
-    ["emt.filters", "emt.scenarios", "emt.metrics", "emt.shapes"], f"{check_functions.__module__}.check_functions"
+    ["emt.filters", "emt.scenarios", "emt.metrics", "emt.shapes"],
+    f"{check_functions.__module__}.check_functions",
 )
 
 hypothesis.settings.register_profile(

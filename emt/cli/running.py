@@ -87,7 +87,8 @@ def run_shown(loaded, folder: Path, *, more: int = 0, runs: int | None = None):
             return run_experiment(loaded, folder, runs=runs, more=more, on_progress=update)
     except KeyboardInterrupt:
         kept = f"{last.done} of {last.total}" if last is not None else "all finished"
-        raise InterruptedRunError(f"interrupted: {kept} runs are kept in {folder}; the same command continues") from None
+        message = f"interrupted: {kept} runs are kept in {folder}; the same command continues"
+        raise InterruptedRunError(message) from None
 
 
 def reproduce(

@@ -45,7 +45,8 @@ def _with_kind(entry: Entry[Any]) -> type:
     declared = entry.settings.model_fields.get("kind")
     if declared is not None and declared.annotation == Literal[entry.name]:
         return entry.settings
-    return create_model(entry.settings.__name__, __base__=entry.settings, kind=(Literal[entry.name], entry.name))
+    kind: Any = (Literal[entry.name], entry.name)
+    return create_model(entry.settings.__name__, __base__=entry.settings, kind=kind)
 
 
 class MonteCarlo(Settings):
@@ -163,12 +164,11 @@ def model_for(data: Any) -> type[Experiment]:
     plugin_scenarios = _plugins(SCENARIOS, [scenario.get("kind")] if isinstance(scenario, dict) else [])
     if not plugin_filters and not plugin_scenarios:
         return Experiment
-    return create_model(
-        "Experiment",
-        __base__=Experiment,
-        filters=(Annotated[dict[Label, union_of(FILTERS, plugin_filters)], Field(min_length=1)], ...),
-        scenario=(union_of(SCENARIOS, plugin_scenarios), ...),
-    )
+    widened: Any = {
+        "filters": (Annotated[dict[Label, union_of(FILTERS, plugin_filters)], Field(min_length=1)], ...),
+        "scenario": (union_of(SCENARIOS, plugin_scenarios), ...),
+    }
+    return create_model("Experiment", __base__=Experiment, **widened)
 
 
 def _plugins(registry: Registry[Any], named: list[Any]) -> tuple[str, ...]:

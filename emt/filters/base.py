@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
 from emt.models.motion import MotionNoise
 from emt.status import Status
-from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Scalar, State
+from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Scalar, State, Traced
 
 GROSS_INNOVATION = 10.0
 """An innovation of more than this many predicted standard deviations sets `Status.GROSS_INNOVATION`."""
@@ -26,7 +26,7 @@ class TrackingModel:
     """Process noise of the constant-velocity motion."""
     sensor_noise: Sym2
     """Covariance of the sensor noise of one point (m²)."""
-    extent_scale: Scalar
+    extent_scale: Traced
     """Covariance of the points over the object in units of the squared semi-axes: 1/4 for a uniform ellipse, 1 for
     Gaussian points whose covariance is the extent."""
 

@@ -13,7 +13,7 @@ from emt.filters.kinematics import Kinematics
 from emt.linalg import Sym2, parallel
 from emt.registry import FILTERS
 from emt.settings import Duration, PositiveFloat, Settings, UnitInterval
-from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar
+from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
 
 
 class TimeConstant(Settings):
@@ -57,8 +57,8 @@ class FeldmannSettings(Settings):
 class Params:
     """Traced numbers of the filter."""
 
-    weight: Scalar
-    decay: Scalar
+    weight: Traced
+    decay: Traced
     """Time constant (s) or factor per step."""
 
 

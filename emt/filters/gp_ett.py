@@ -23,7 +23,7 @@ from emt.settings import (
     Settings,
 )
 from emt.status import Status
-from emt.types import Estimate, Filter, Measurements, Prior, Scalar, StarConvex
+from emt.types import Estimate, Filter, Measurements, Prior, Scalar, StarConvex, Traced
 
 N_MOTION = 6
 """State entries before the radii: centre (2), orientation, velocity (2), turn rate."""
@@ -64,14 +64,14 @@ class GpEttSettings(Settings):
 class Params:
     """Traced numbers of the filter."""
 
-    radius_var: Scalar
-    offset_var: Scalar
-    length_scale: Scalar
-    orientation_variance: Scalar
-    turn_rate_variance: Scalar
-    turn_acceleration_psd: Scalar
-    forgetting_rate: Scalar
-    outline_variance: Scalar
+    radius_var: Traced
+    offset_var: Traced
+    length_scale: Traced
+    orientation_variance: Traced
+    turn_rate_variance: Traced
+    turn_acceleration_psd: Traced
+    forgetting_rate: Traced
+    outline_variance: Traced
 
 
 class GpState(NamedTuple):
@@ -95,10 +95,14 @@ def kernel(u: Float[Array, "..."], v: Float[Array, "..."], params: Params) -> Fl
 
 
 def contour(angles: Float[Array, "n_angles"], params: Params) -> Contour:
-    """Covariance of the radii at the basis angles and its inverse."""
+    """Covariance of the radii at the basis angles and its inverse.
+
+    In single precision the jitter is raised to the rounding error of the matrix, below which the inverse means nothing.
+    """
+    n, dtype = angles.shape[0], angles.dtype
     cov = kernel(angles[:, None], angles[None, :], params)
-    eye = jnp.eye(angles.shape[0], dtype=angles.dtype)
-    return Contour(angles, cov, jnp.linalg.inv(cov + JITTER * eye))
+    jitter = jnp.maximum(JITTER, 10.0 * n * jnp.finfo(dtype).eps * (params.radius_var + params.offset_var))
+    return Contour(angles, cov, jnp.linalg.inv(cov + jitter * jnp.eye(n, dtype=dtype)))
 
 
 def predict(state: GpState, dt: Scalar, gp: Contour, model: TrackingModel, params: Params) -> GpState:

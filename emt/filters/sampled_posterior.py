@@ -15,7 +15,7 @@ from emt.filters.base import ScanStatistics, TrackingModel, innovation_info, sca
 from emt.linalg import Sym2, Vec2, parallel
 from emt.registry import FILTERS
 from emt.settings import PositiveAngleVariance, Settings, ShapeParameter
-from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar
+from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
 
 
 class SampledPosteriorSettings(Settings):
@@ -38,8 +38,8 @@ class SampledPosteriorSettings(Settings):
 class Params:
     """Traced numbers of the filter."""
 
-    shape: tuple[Scalar, Scalar]
-    orientation_variance: Scalar
+    shape: tuple[Traced, Traced]
+    orientation_variance: Traced
 
 
 class SampledState(NamedTuple):

@@ -15,7 +15,7 @@ from emt.linalg import Sym2, Vec2, fuse, rotated_diagonal
 from emt.registry import FILTERS
 from emt.settings import AngleVariance, PositiveAngleVariance, Settings, ShapeParameter, UnitInterval
 from emt.status import Status
-from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar
+from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
 
 MIN_SHAPE = 1.25
 """Floor of the inverse-gamma shapes after forgetting: the mean extent exists only above 1."""
@@ -43,10 +43,10 @@ class VbRandomMatrixSettings(Settings):
 class Params:
     """Traced numbers of the filter."""
 
-    shape: tuple[Scalar, Scalar]
-    orientation_variance: Scalar
-    orientation_noise: Scalar
-    forgetting: Scalar
+    shape: tuple[Traced, Traced]
+    orientation_variance: Traced
+    orientation_noise: Traced
+    forgetting: Traced
 
 
 class VbState(NamedTuple):

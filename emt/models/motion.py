@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from emt.linalg import Mat2, Sym2
-from emt.types import Scalar
+from emt.types import Scalar, Traced
 
 
 @register_dataclass
@@ -47,7 +47,7 @@ class WhiteAcceleration:
     position noise, the velocity noise has regression 3/(2T) and variance psd T/4.
     """
 
-    psd: Scalar
+    psd: Traced
     """Power spectral density of the acceleration on each axis (m²/s³); σ² of the paper."""
 
     def __call__(self, dt: Scalar) -> ProcessNoise:

@@ -17,7 +17,7 @@ from emt.metrics.base import METRICS, Metric
 from emt.models.motion import FixedNoise, WhiteAcceleration
 from emt.montecarlo.run import Rules, Scores, Tracker, score
 from emt.registry import FILTERS, SCENARIOS
-from emt.types import Ellipse, Measurements, Prior, Scalar, Scenario, Truth
+from emt.types import Ellipse, Measurements, Prior, Scenario, Traced, Truth
 
 
 class Simulation(NamedTuple):
@@ -33,7 +33,7 @@ class WorldParams(NamedTuple):
     scenario: Any
     model: TrackingModel
     prior: Prior
-    position_limit: Scalar
+    position_limit: Traced
 
 
 def cast(tree, dtype):
@@ -79,7 +79,11 @@ class Program:
                 Sym2.of(np.array(model.noise_cov)),
                 model.extent_scale,
             ),
-            Prior(np.array(prior.mean), np.array(prior.cov), Ellipse(np.array(prior.semi_axes), prior.orientation)),
+            Prior(
+                jnp.asarray(prior.mean),
+                jnp.asarray(prior.cov),
+                Ellipse(jnp.asarray(prior.semi_axes), jnp.asarray(prior.orientation)),
+            ),
             np.inf if experiment.divergence is None else experiment.divergence.position_error_above,
         )
         built = {label: FILTERS.get(settings.kind).builder(settings) for label, settings in experiment.filters.items()}

@@ -24,7 +24,7 @@ def value_and_error(value: float | None, error: float | None) -> tuple[str, str]
     """A value and its standard error, both to two significant digits of the error."""
     if value is None:
         return "–", ""
-    if error is None:
+    if error is None or error <= 1e-9 * abs(value):
         return significant(value, 4), ""
     decimals = decimals_for(error)
     return f"{value:.{decimals}f}", f"{error:.{decimals}f}"

@@ -5,7 +5,6 @@ from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 from pydantic import PositiveInt
@@ -24,7 +23,7 @@ from emt.settings import (
     Settings,
     Speed,
 )
-from emt.types import Ellipse, Scalar, Scenario, Truth
+from emt.types import Ellipse, Scenario, Traced, Truth
 
 
 class ConstantVelocitySettings(Settings):
@@ -58,11 +57,11 @@ class ConstantVelocitySettings(Settings):
 class Params:
     """Traced numbers of the scenario."""
 
-    dt: Scalar
+    dt: Traced
     start: Float[Array, "5"]
     """x, y, vx, vy, orientation one step before the first scan."""
     noise: WhiteAcceleration
-    orientation_noise: Scalar
+    orientation_noise: Traced
     semi_axes: Float[Array, "2"]
     detections: DetectionParams
 
@@ -71,10 +70,10 @@ def build(settings: ConstantVelocitySettings, runs: int):
     """Traced parameters and static builder of the settings."""
     params = Params(
         settings.dt,
-        np.array([*settings.position, *settings.velocity, settings.orientation]),
+        jnp.asarray([*settings.position, *settings.velocity, settings.orientation]),
         WhiteAcceleration(settings.acceleration_psd),
         settings.orientation_noise,
-        np.array(settings.semi_axes),
+        jnp.asarray(settings.semi_axes),
         params_of(settings.detections),
     )
     detections, n_steps = settings.detections, settings.steps

@@ -15,7 +15,7 @@ from scipy.stats import poisson
 from emt.keys import step_key
 from emt.linalg import Mat2
 from emt.settings import NoiseCovariance, Settings
-from emt.types import Measurements, Scalar, Truth
+from emt.types import Measurements, Scalar, Traced, Truth
 
 OVERFLOW_PROBABILITY = 1e-9
 """Bound on the probability that any scan of a whole experiment exceeds the capacity."""
@@ -56,7 +56,7 @@ class DetectionSettings(Settings):
 class DetectionParams:
     """Traced numbers of the detections."""
 
-    mean_count: Scalar
+    mean_count: Traced
     noise_chol: Mat2
 
 

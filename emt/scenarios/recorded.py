@@ -14,7 +14,7 @@ from pydantic import Field
 
 from emt.registry import SCENARIOS
 from emt.settings import Duration, Settings
-from emt.types import Ellipse, Measurements, Scalar, Scenario, Truth
+from emt.types import Ellipse, Measurements, Scenario, Traced, Truth
 
 MAX_BYTES = 1 << 30
 """Largest file that is read."""
@@ -48,7 +48,7 @@ class DataError(ValueError):
 class Params:
     """The recording, as arrays."""
 
-    dt: Scalar
+    dt: Traced
     points: Float[Array, "n_steps max_points 2"]
     mask: Bool[Array, "n_steps max_points"]
 
@@ -155,7 +155,7 @@ def build(settings: RecordedSettings, runs: int):
 
         return Scenario(jnp.full(n_steps, params.dt), no_truth, scans)
 
-    return Params(settings.dt, points, mask), make
+    return Params(settings.dt, jnp.asarray(points), jnp.asarray(mask)), make
 
 
 SCENARIOS.register("recorded", RecordedSettings, build)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 from pydantic import PositiveInt
@@ -12,7 +11,7 @@ from pydantic import PositiveInt
 from emt.registry import SCENARIOS
 from emt.scenarios.detections import DetectionParams, DetectionSettings, capacity_for, params_of, sample_scans
 from emt.settings import Angle, Duration, Length, PositiveLength, Settings
-from emt.types import Ellipse, Scalar, Scenario, Truth
+from emt.types import Ellipse, Scenario, Traced, Truth
 
 
 class StationarySettings(Settings):
@@ -38,9 +37,9 @@ class StationarySettings(Settings):
 class Params:
     """Traced numbers of the scenario."""
 
-    dt: Scalar
+    dt: Traced
     position: Float[Array, "2"]
-    orientation: Scalar
+    orientation: Traced
     semi_axes: Float[Array, "2"]
     detections: DetectionParams
 
@@ -49,9 +48,9 @@ def build(settings: StationarySettings, runs: int):
     """Traced parameters and static builder of the settings."""
     params = Params(
         settings.dt,
-        np.array(settings.position),
+        jnp.asarray(settings.position),
         settings.orientation,
-        np.array(settings.semi_axes),
+        jnp.asarray(settings.semi_axes),
         params_of(settings.detections),
     )
     detections, n_steps = settings.detections, settings.steps

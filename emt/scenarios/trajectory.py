@@ -12,7 +12,7 @@ from pydantic import PositiveInt
 from emt.registry import SCENARIOS
 from emt.scenarios.detections import DetectionParams, DetectionSettings, capacity_for, params_of, sample_scans
 from emt.settings import Angle, Duration, Length, PositiveLength, Settings, Speed
-from emt.types import Ellipse, Scalar, Scenario, Truth
+from emt.types import Ellipse, Scenario, Traced, Truth
 
 
 class Leg(Settings):
@@ -50,7 +50,7 @@ class TrajectorySettings(Settings):
 class Params:
     """Traced numbers of the scenario."""
 
-    dt: Scalar
+    dt: Traced
     start: Float[Array, "2"]
     heading: Float[Array, "n_steps"]
     speed: Float[Array, "n_steps"]
@@ -73,10 +73,10 @@ def build(settings: TrajectorySettings, runs: int):
     heading, speed = headings_and_speeds(settings)
     params = Params(
         settings.dt,
-        np.array(settings.start),
-        heading,
-        speed,
-        np.array(settings.semi_axes),
+        jnp.asarray(settings.start),
+        jnp.asarray(heading),
+        jnp.asarray(speed),
+        jnp.asarray(settings.semi_axes),
         params_of(settings.detections),
     )
     detections, n_steps = settings.detections, settings.n_steps
@@ -90,7 +90,7 @@ def build(settings: TrajectorySettings, runs: int):
             velocity = params.speed[:, None] * jnp.stack([jnp.cos(params.heading), jnp.sin(params.heading)], axis=1)
             moves = (params.dt * velocity).at[0].set(0.0)
             return Truth(
-                params.start + jnp.cumsum(moves, axis=0),
+                params.start[None, :] + jnp.cumsum(moves, axis=0),
                 velocity,
                 Ellipse(jnp.broadcast_to(params.semi_axes, (n_steps, 2)), params.heading),
             )

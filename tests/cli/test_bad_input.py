@@ -44,7 +44,8 @@ def test_a_mistake_is_named_with_its_line(tmp_path, capsys, right, wrong, messag
 
 
 def test_all_mistakes_are_named_at_once(tmp_path, capsys):
-    text = TEXT.replace("runs: 40", "runs: 0").replace("psd: 0.01", "psd: -1").replace("metrics: [gw,", "metrics: [gww,")
+    text = TEXT.replace("runs: 40", "runs: 0").replace("psd: 0.01", "psd: -1")
+    text = text.replace("metrics: [gw,", "metrics: [gww,")
     outcome = emt(capsys, "run", write(tmp_path, text))
     assert outcome.code == 2
     for key in ("monte_carlo.runs", "model.process_noise.psd", "metrics[0]"):

@@ -15,7 +15,8 @@ MANY = TEXT.replace("runs: 40", "runs: 1280")
 
 def results(folder):
     """Every file whose bytes follow from the configuration alone."""
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix in (".npz", ".md", ".png") or p.name == "summary.json"}
+    files = [p for p in folder.iterdir() if p.suffix in (".npz", ".md", ".png") or p.name == "summary.json"]
+    return {p.name: p.read_bytes() for p in files}
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ def test_a_wrong_number_is_found(changed, capsys):
 
     outcome = emt(capsys, "verify", changed(edit))
     assert outcome.code == 1
-    assert [line for line in outcome.out.splitlines() if "OUTSIDE" in line][0].startswith("position")
+    assert next(line for line in outcome.out.splitlines() if "OUTSIDE" in line).startswith("position")
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,8 @@ def settings_of(case: Case, which: str):
         case "mem_ekf_star":
             big, small = 100.0 * np.array(MEM_NOISE), 1e-8 * np.array(MEM_COV)
             return MemEkfStarSettings(
-                shape_cov=MEM_COV if forgetful else small.tolist(), shape_noise=(big if forgetful else 0 * big).tolist()
+                shape_cov=MEM_COV if forgetful else small.tolist(),
+                shape_noise=(big if forgetful else 0 * big).tolist(),
             )
         case "feldmann":
             decay = {"kind": "time_constant", "time": 0.05 if forgetful else 1e9}
@@ -98,7 +99,9 @@ def scans_of(sequence: Sequence, source: str, seed: int):
     c, s = np.cos(sequence.angle), np.sin(sequence.angle)
     around = rng.uniform(0.0, 2.0 * np.pi, (STEPS, SLOTS))
     radius = np.sqrt(rng.uniform(size=(STEPS, SLOTS))) if source == "filled" else np.ones((STEPS, SLOTS))
-    body = np.stack([sequence.axes[0] * radius * np.cos(around), sequence.axes[1] * radius * np.sin(around)], -1)
+    body = np.stack(
+        [sequence.axes[0] * radius * np.cos(around), sequence.axes[1] * radius * np.sin(around)], -1
+    )
     xx, xy, yy = sequence.noise
     l11 = np.sqrt(xx)
     l21 = xy / l11 if l11 > 0.0 else 0.0
@@ -117,7 +120,9 @@ def problem_of(case: Case, sequence: Sequence, seed: int) -> Problem:
     cov = np.diag(cov) if cov.ndim == 1 else cov
     start = np.array([*np.add(sequence.origin, sequence.prior_offset), *sequence.velocity])
     prior = Prior(
-        u * start, u**2 * cov, Ellipse(u * np.array(sequence.prior_axes), np.asarray(sequence.angle + sequence.prior_turn))
+        u * start,
+        u**2 * cov,
+        Ellipse(u * np.array(sequence.prior_axes), np.asarray(sequence.angle + sequence.prior_turn)),
     )
     noise = Sym2(*(u**2 * np.asarray(entry) for entry in sequence.noise))
     model = TrackingModel(WhiteAcceleration(np.asarray(u**2 * sequence.psd)), noise, np.asarray(0.25))

@@ -73,7 +73,10 @@ def test_position_update_is_the_kalman_filter():
 @pytest.mark.parametrize("psd", [0.0, 1e-6, 1.0])
 def test_long_chains_stay_definite(psd):
     """Alternately a step of 1 ms and one of an hour, with an accurate position in between: all factors stay positive."""
-    noise, sensor = WhiteAcceleration(jnp.asarray(psd)), Sym2(jnp.asarray(1e-6), jnp.asarray(0.0), jnp.asarray(1.0))
+    noise, sensor = (
+        WhiteAcceleration(jnp.asarray(psd)),
+        Sym2(jnp.asarray(1e-6), jnp.asarray(0.0), jnp.asarray(1.0)),
+    )
 
     def step(belief, k):
         dt = jnp.where(k % 2 == 0, 1e-3, 3600.0)

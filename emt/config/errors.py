@@ -47,9 +47,11 @@ class ConfigError(Exception):
 
     Attributes:
         problems: All that was found, by line; those without a line come last.
+        readable: What could be read of the file in spite of them, to look for further problems in; or None.
     """
 
-    def __init__(self, problems: Iterable[Problem]):
+    def __init__(self, problems: Iterable[Problem], readable: Any = None):
+        self.readable = readable
         unique = dict.fromkeys(problems)
         self.problems = tuple(sorted(unique, key=lambda p: (p.line is None, p.line or 0)))
         super().__init__("\n".join(map(str, self.problems)))

@@ -69,7 +69,29 @@ def load_experiment(text: str, overrides: Iterable[str] = ()) -> Loaded:
         ConfigError: with every problem found.
     """
     path = find_config(text)
-    source = apply_overrides(load_source(path), overrides)
+    overrides = list(overrides)
+    try:
+        source = load_source(path)
+    except ConfigError as error:
+        # a file with, say, a key given twice may hold further mistakes: all are named at once
+        problems = list(error.problems)
+        if error.readable is not None:
+            try:
+                check(apply_overrides(error.readable, overrides), path)
+            except ConfigError as more:
+                problems += more.problems
+        raise ConfigError(problems) from None
+    source = apply_overrides(source, overrides)
+    experiment = check(source, path)
+    return Loaded(experiment_name(path, experiment), experiment, source)
+
+
+def check(source: Source, path: Path) -> Experiment:
+    """The experiment that a source describes.
+
+    Raises:
+        ConfigError: with every problem found.
+    """
     if str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # a plug-in may stand beside the file that names it
     try:
@@ -80,7 +102,7 @@ def load_experiment(text: str, overrides: Iterable[str] = ()) -> Loaded:
     problems = list(contradictions(experiment, source))
     if problems:
         raise ConfigError(problems)
-    return Loaded(experiment_name(path, experiment), experiment, source)
+    return experiment
 
 
 def experiment_name(path: Path, experiment: Experiment) -> str:

@@ -123,13 +123,22 @@ def parse_source(text: str, path: str | Path) -> Source:
         ConfigError: As for ``load_source``.
     """
     file = str(path)
-    document = parse_document(text, file)
+    try:
+        document = parse_document(text, file)
+    except ConfigError as error:
+        if isinstance(error.readable, Document) and isinstance(error.readable.value, dict):
+            raise ConfigError(error.problems, _source_of(error.readable, path)) from None
+        raise ConfigError(error.problems) from None
     if document is None or document.value is None:
         raise ConfigError([Problem(file, None, "", "the file is empty")])
     if not isinstance(document.value, dict):
         message = "expected settings as 'key: value' at the top of the file"
         raise ConfigError([Problem(file, document.line, "", message)])
-    places = {key_path: Place(file, line) for key_path, line in document.lines.items()}
+    return _source_of(document, path)
+
+
+def _source_of(document: "Document", path: str | Path) -> Source:
+    places = {key_path: Place(str(path), line) for key_path, line in document.lines.items()}
     return Source(Path(path), document.value, places)
 
 
@@ -202,9 +211,10 @@ class _Parser:
         self.spent = 0
         self.lines[()] = line
         value = self.expand(root, (), 0, line)
+        document = Document(value, self.lines, line, bool(getattr(first, "flow_style", False)), end)
         if self.problems:
-            raise ConfigError(self.problems)
-        return Document(value, self.lines, line, bool(getattr(first, "flow_style", False)), end)
+            raise ConfigError(self.problems, document)
+        return document
 
     def stop(self, line: int | None, message: str) -> NoReturn:
         raise ConfigError([*self.problems, Problem(self.file, line, "", message)])

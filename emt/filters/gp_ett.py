@@ -95,14 +95,10 @@ def kernel(u: Float[Array, "..."], v: Float[Array, "..."], params: Params) -> Fl
 
 
 def contour(angles: Float[Array, "n_angles"], params: Params) -> Contour:
-    """Covariance of the radii at the basis angles and its inverse.
-
-    In single precision the jitter is raised to the rounding error of the matrix, below which the inverse means nothing.
-    """
-    n, dtype = angles.shape[0], angles.dtype
+    """Covariance of the radii at the basis angles and its inverse."""
     cov = kernel(angles[:, None], angles[None, :], params)
-    jitter = jnp.maximum(JITTER, 10.0 * n * jnp.finfo(dtype).eps * (params.radius_var + params.offset_var))
-    return Contour(angles, cov, jnp.linalg.inv(cov + jitter * jnp.eye(n, dtype=dtype)))
+    eye = jnp.eye(angles.shape[0], dtype=angles.dtype)
+    return Contour(angles, cov, jnp.linalg.inv(cov + JITTER * eye))
 
 
 def predict(state: GpState, dt: Scalar, gp: Contour, model: TrackingModel, params: Params) -> GpState:

@@ -18,6 +18,7 @@ from emt.scenarios.detections import (
     unit_disc,
 )
 from emt.types import Ellipse, Truth
+from tests.filters.cases import FAST_COMPILE
 
 AXES, ANGLE, CENTRE = np.array([6.0, 2.0]), 0.7, np.array([100.0, -50.0])
 TURN = np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
@@ -39,7 +40,10 @@ def truth() -> Truth:
 @cache
 def scans_of(settings: DetectionSettings, capacity: int, seed: int = 0):
     params = jax.tree.map(jnp.asarray, params_of(settings))
-    draw = jax.jit(lambda key, params: sample_scans(key, truth(), settings, params, capacity))
+    draw = jax.jit(
+        lambda key, params: sample_scans(key, truth(), settings, params, capacity),
+        compiler_options=FAST_COMPILE,
+    )
     return jax.tree.map(np.asarray, draw(jax.random.key(seed), params))
 
 

@@ -1,0 +1,86 @@
+"""README, notes and tracked tables say what is so."""
+
+import re
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from emt.config.load import load_experiment
+from emt.montecarlo.chunks import Engine
+from emt.montecarlo.program import Program
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def block(language: str) -> str:
+    """The code block of a language in README."""
+    return re.search(rf"```{language}\n(.*?)```", README, re.S)[1]
+
+
+@pytest.fixture
+def beside(tmp_path, monkeypatch):
+    """The folder in which a reader of README writes experiment and filter."""
+    (tmp_path / "mine.yaml").write_text(block("yaml"), encoding="utf-8")
+    (tmp_path / "nearest.py").write_text(block("python"), encoding="utf-8")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    return tmp_path
+
+
+def test_the_experiment_in_readme_is_valid(beside):
+    experiment = load_experiment(str(beside / "mine.yaml")).experiment
+    assert experiment.scenario.n_steps == 80
+    assert experiment.scenario.speed == pytest.approx(60 / 3.6)
+
+
+def test_the_filter_in_readme_works_like_any_other(beside):
+    text = block("yaml").replace("metrics: [", "  nearest: {kind: 'nearest:NearestSettings', size: 6 m}\nmetrics: [")
+    text = re.sub(r"  (vb|vb_3|feldmann): .*\n", "", text).replace("runs: 500", "chunk: 16, runs: 500")
+    path = beside / "plugin.yaml"
+    path.write_text(text, encoding="utf-8")
+    experiment = load_experiment(str(path)).experiment
+    assert list(experiment.filters) == ["nearest"]
+    with jax.numpy_dtype_promotion("standard"):
+        engine = Engine(Program.of(experiment), 1, 16)
+        engine.compile()
+    arrays = engine.run_chunk(0, 16)
+    assert not arrays["nearest/status"].any()
+    nees = arrays["nearest/values"][:, 4]
+    assert 0.5 < np.mean(nees) < 8.0
+    assert jnp.isfinite(arrays["nearest/values"]).all()
+
+
+def test_the_excerpt_in_readme_stands_in_the_report():
+    excerpt = README.split("<!-- excerpt -->")[1].split("<!-- /excerpt -->")[0].strip().splitlines()
+    report = (ROOT / "results" / "tables" / "tuncer2021.md").read_text(encoding="utf-8")
+    assert len(excerpt) > 5
+    for line in excerpt:
+        assert line in report
+
+
+def test_pictures_of_readme_and_reports_exist():
+    for document in (ROOT / "README.md", *(ROOT / "results" / "tables").glob("*.md")):
+        for target in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", document.read_text(encoding="utf-8")):
+            assert (document.parent / target).is_file(), target
+
+
+@pytest.mark.parametrize("report", sorted((ROOT / "results" / "tables").glob("*2*.md")), ids=lambda p: p.stem)
+def test_every_number_that_does_not_agree_has_a_sentence(report):
+    """One row of notes.md for each published cell whose verdict is not `agrees`."""
+    notes = (ROOT / "experiments" / report.stem / "notes.md").read_text(encoding="utf-8")
+    explained = {tuple(c.strip() for c in line.split("|")[1:5]) for line in notes.splitlines() if line.startswith("| ")}
+    found = 0
+    title = ""
+    for line in report.read_text(encoding="utf-8").splitlines():
+        if line.startswith("**"):
+            title = re.match(r"\*\*(Table \w+)", line)[1] if line.startswith("**Table") else ""
+        cells = [cell.strip() for cell in line.split("|")]
+        verdicts = {"close", "differs", "not comparable"}
+        if title and len(cells) > 9 and cells[8] in verdicts:
+            found += 1
+            assert (title, cells[1], cells[2], cells[4]) in explained, line
+    assert found

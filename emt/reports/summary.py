@@ -10,6 +10,8 @@ from emt.status import FAILURE, Status
 from emt.store import RunReader
 
 SUMMARY_FILE = "summary.json"
+MAX_BLOCKS = 512
+"""Blocks of runs whose sums per step are held at a time."""
 
 
 class Curve(NamedTuple):
@@ -44,14 +46,30 @@ class FilterResults(NamedTuple):
 
 
 def filter_results(reader: RunReader, label: str) -> FilterResults:
-    """All chunks of one filter, in run order."""
-    names = [f"{label}/{name}" for name in FilterResults._fields]
-    chunks = [reader.read_chunk(chunk, names) for chunk in reader.chunks()]
-    columns = {name: [chunk[f"{label}/{name}"] for chunk in chunks] for name in FilterResults._fields}
-    squares = columns.pop("step_squares")
+    """All chunks of one filter, in run order; sums per step are merged as they come, to at most `MAX_BLOCKS` blocks."""
+    per_run: dict[str, list[np.ndarray]] = {name: [] for name in ("values", "status", "failed_step", "nis")}
+    sums: list[np.ndarray] = []
+    counts: list[int] = []
+    squares: np.ndarray | float = 0.0
+    for chunk in reader.chunks():
+        arrays = reader.read_chunk(chunk, [f"{label}/{name}" for name in FilterResults._fields])
+        for name, parts in per_run.items():
+            parts.append(arrays[f"{label}/{name}"])
+        sums += list(arrays[f"{label}/step_sum"])
+        counts += arrays[f"{label}/step_count"].tolist()
+        squares = squares + arrays[f"{label}/step_squares"]
+        if len(sums) > MAX_BLOCKS:
+            sums = [sum(pair[1:], pair[0]) for pair in batched(sums, 2)]
+            counts = [sum(pair) for pair in batched(counts, 2)]
+    whole = {name: np.concatenate(parts) for name, parts in per_run.items()}
     return FilterResults(
-        **{name: np.concatenate(parts) for name, parts in columns.items()}, step_squares=np.sum(squares, axis=0)
+        **whole, step_sum=np.stack(sums), step_count=np.array(counts), step_squares=np.asarray(squares)
     )
+
+
+def batched(items: list, n: int) -> list[list]:
+    """Consecutive groups of `n` items; the last may be shorter."""
+    return [items[k : k + n] for k in range(0, len(items), n)]
 
 
 def standard_error_of_std(values: np.ndarray) -> float:

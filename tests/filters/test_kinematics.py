@@ -72,7 +72,7 @@ def test_position_update_is_the_kalman_filter():
 
 @pytest.mark.parametrize("psd", [0.0, 1e-6, 1.0])
 def test_long_chains_stay_definite(psd):
-    """Alternately a step of 1 ms and one of an hour, with an accurate position in between: all factors stay positive."""
+    """Steps of 1 ms and of an hour in turn, an accurate position in between: all factors stay positive."""
     noise, sensor = (
         WhiteAcceleration(jnp.asarray(psd)),
         Sym2(jnp.asarray(1e-6), jnp.asarray(0.0), jnp.asarray(1.0)),

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import emt.filters.catalogue  # noqa: F401 - registers the filters
 from emt.linalg import Sym2
-from emt.status import FAILURE, Status
+from emt.status import FAILURE
 from emt.types import Ellipse, Measurements, Prior
 from tests.filters.cases import (
     CASES,
@@ -43,11 +43,15 @@ ROUNDING = {"vb_random_matrix": 1e-12, "mem_ekf_star": 1e-12, "feldmann": 1e-12,
 
 
 @main
-def test_batch_equals_one_by_one(case):
-    """Runs do not see each other."""
+def test_batch_equals_one_by_one_and_padding_does_not_matter(case):
+    """Runs do not see each other; up to rounding, as sums over more slots may be taken in another order."""
+    given = problems(case)
+    pad = ((0, 0), (0, 0), (0, 3))
+    points = jnp.pad(given.scans.points, (*pad, (0, 0)), constant_values=jnp.nan)
+    wider = given._replace(scans=Measurements(points, jnp.pad(given.scans.mask, pad), given.scans.overflow))
     batch, one_by_one = report(solved(case)[0]), tracker(case)
-    for run in (0, N_RUNS - 1):
-        alone = report(one_by_one(pick(problems(case), run))[0])
+    for run in range(0, N_RUNS, 3):
+        alone = report(one_by_one(pick(wider, run))[0])
         assert_same(case, alone, Report(*(field[run] for field in batch)), ROUNDING[case.label])
 
 
@@ -127,21 +131,27 @@ def test_gradients_are_finite_and_equal_finite_differences(case):
 def test_single_precision_is_near_double_precision(case):
     """Nothing is promoted on the way, and nothing is lost but digits.
 
-    Runs in which the linearisation of `gp_ett` fails (it says so) end elsewhere after any change of the last digit.
+    Not in every run of `gp_ett`: its linearisation may fail, and then the last digit decides where it goes.
     """
     estimate, info = batch_tracker(case)(cast(problems(case), np.float32))
     assert {leaf.dtype for leaf in jax.tree.leaves(estimate)} == {jnp.dtype(np.float32)}
-    status = np.asarray(info.status) | np.asarray(solved(case)[1].status)
-    assert not (status & int(FAILURE)).any()
-    calm = ~(status & int(Status.GROSS_INNOVATION)).any(axis=1)
-    assert calm.sum() >= N_RUNS // 2
-    ours, theirs = (Report(*(part[calm] for part in report(e))) for e in (estimate, solved(case)[0]))
-    found = differences(case, ours, theirs)
-    assert max(found.values()) < SINGLE[case.label], found
+    assert not (np.asarray(info.status) & int(FAILURE)).any()
+    ours, theirs = report(estimate), report(solved(case)[0])
+    found = [
+        max(differences(case, *(Report(*(part[run] for part in side)) for side in (ours, theirs))).values())
+        for run in range(N_RUNS)
+    ]
+    tolerance, runs = SINGLE[case.label]
+    assert (np.array(found) < tolerance).sum() >= runs, found
 
 
-SINGLE = {"vb_random_matrix": 1e-5, "mem_ekf_star": 1e-5, "feldmann": 1e-5, "gp_ett": 0.5}
-"""Largest relative change; the kernel matrix of `gp_ett` has a condition beyond the digits of single precision."""
+SINGLE = {
+    "vb_random_matrix": (1e-5, N_RUNS),
+    "mem_ekf_star": (1e-5, N_RUNS),
+    "feldmann": (1e-5, N_RUNS),
+    "gp_ett": (0.3, N_RUNS - 2),
+}
+"""Largest relative change, and how many runs keep to it."""
 
 
 @cache

@@ -10,7 +10,7 @@ from emt.filters.base import TrackingModel, as_scan, guarded, scan_statistics
 from emt.linalg import Sym2
 from emt.models.motion import WhiteAcceleration
 from emt.types import Ellipse, Prior
-from tests.filters.cases import cast
+from tests.filters.cases import FAST_COMPILE, cast
 from tests.reference.sampled_posterior import sampled_posterior
 
 N, REPEATS = 20_000, 6
@@ -43,7 +43,7 @@ def ours():
         state, info = flt.update(state, as_scan(jnp.asarray(POINTS), 8), key)
         return flt.estimate(state), state.state.matched, info
 
-    return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(3), REPEATS))
+    return jax.jit(jax.vmap(run), compiler_options=FAST_COMPILE)(jax.random.split(jax.random.key(3), REPEATS))
 
 
 def test_moments_agree_with_the_reference(ours):
@@ -71,7 +71,8 @@ def test_known_shape_leaves_the_kalman_filter():
     """With a prior that knows orientation and axes the posterior is that of a linear Gaussian model, up to 1e-4."""
     flt = build((1e10, 1e10), 1e-12, 1000)
     key = jax.random.key(1)
-    state, _ = flt.update(flt.init(prior(), key), as_scan(jnp.asarray(POINTS), 5), key)
+    update = jax.jit(flt.update, compiler_options=FAST_COMPILE)
+    state, _ = update(flt.init(prior(), key), as_scan(jnp.asarray(POINTS), 5), key)
     estimate = flt.estimate(state)
     c, s = np.cos(ANGLE), np.sin(ANGLE)
     turn = np.array([[c, -s], [s, c]])
@@ -91,7 +92,8 @@ def test_inverse_gamma_moments_survive_the_matching():
     key = jax.random.key(2)
     state = flt.init(prior(), key).state.matched
     scan = as_scan(jnp.zeros((0, 2)), 4)
-    samples = sampled.draw(state, scan_statistics(scan), tracking_model(), key, 100_000)
+    draw = jax.jit(sampled.draw, static_argnums=4, compiler_options=FAST_COMPILE)
+    samples = draw(state, scan_statistics(scan), tracking_model(), key, 100_000)
     flat = samples._replace(log_weight=jnp.zeros_like(samples.log_weight))
     back = sampled.match(state, flat).matched
     np.testing.assert_allclose([float(back.shape.x), float(back.shape.y)], SHAPE, rtol=0.05)

@@ -7,7 +7,7 @@ import pytest
 from emt.scenarios import constant_velocity, stationary
 from emt.scenarios.constant_velocity import ConstantVelocitySettings
 from emt.scenarios.stationary import StationarySettings
-from tests.filters.cases import cast
+from tests.filters.cases import FAST_COMPILE, cast
 
 DETECTIONS = {
     "count": {"kind": "fixed", "count": 3},
@@ -83,7 +83,7 @@ def test_stationary_object_stays():
     np.testing.assert_array_equal(np.asarray(truth.position), np.broadcast_to([3.0, 4.0], (4, 2)))
     np.testing.assert_array_equal(np.asarray(truth.velocity), np.zeros((4, 2)))
     np.testing.assert_array_equal(np.asarray(truth.ellipse.orientation), np.full(4, 0.2))
-    scans = scenario.sample_scans(truth, jax.random.key(1))
+    scans = jax.jit(scenario.sample_scans, compiler_options=FAST_COMPILE)(truth, jax.random.key(1))
     assert scans.points.shape == (4, 3, 2)
     assert scenario.dt.shape == (settings.n_steps,)
     assert np.abs(np.asarray(scans.points) - [3.0, 4.0]).max() < 10.0

@@ -131,7 +131,9 @@ def test_longer_tracks_extend_shorter_ones():
     settings = settings_of({"kind": "poisson", "mean": 5.0})
     params = jax.tree.map(jnp.asarray, params_of(settings))
     start = jax.tree.map(lambda leaf: leaf[:20], truth())
-    short = jax.jit(lambda key: sample_scans(key, start, settings, params, 30))(jax.random.key(0))
+    short = jax.jit(
+        lambda key: sample_scans(key, start, settings, params, 30), compiler_options=FAST_COMPILE
+    )(jax.random.key(0))
     long = scans_of(settings, 30)
     np.testing.assert_allclose(np.asarray(short.points), long.points[:20], rtol=1e-14)
     np.testing.assert_array_equal(np.asarray(short.mask), long.mask[:20])

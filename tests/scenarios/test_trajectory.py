@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from emt.scenarios import trajectory
 from emt.scenarios.trajectory import TrajectorySettings, headings_and_speeds
-from tests.filters.cases import cast
+from tests.filters.cases import FAST_COMPILE, cast
 
 SPEED = 500.0 / 36.0
 PI = np.pi
@@ -75,7 +75,7 @@ def test_truth_is_the_same_in_every_run_and_scans_are_not():
     np.testing.assert_array_equal(np.asarray(scenario.dt), np.full(103, 10.0))
     truth, again = scenario.sample_truth(jax.random.key(0)), scenario.sample_truth(jax.random.key(1))
     np.testing.assert_array_equal(np.asarray(truth.position), np.asarray(again.position))
-    sample = jax.jit(scenario.sample_scans)
+    sample = jax.jit(scenario.sample_scans, compiler_options=FAST_COMPILE)
     first, second = sample(truth, jax.random.key(0)), sample(truth, jax.random.key(1))
     assert bool(jnp.any(first.mask != second.mask))
     assert first.points.shape[:1] == (103,)

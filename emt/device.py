@@ -3,6 +3,7 @@
 import os
 import platform
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 
@@ -19,6 +20,17 @@ def configure() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+def cpu_name() -> str:
+    """Model of the processor, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor()
+    )
+
+
 def environment() -> dict[str, Any]:
     """Versions and device, for the record of a result."""
     import jax
@@ -28,6 +40,7 @@ def environment() -> dict[str, Any]:
         "device": str(jax.devices()[0].device_kind),
         "backend": jax.default_backend(),
         "machine": platform.machine(),
+        "cpu": cpu_name(),
         "python": platform.python_version(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         **{name: version(name) for name in packages},

@@ -20,7 +20,8 @@ from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar
 PIVOT_FLOOR = 1e-12
 """Smallest pivot of I - Uᵀ Λ U; mathematically it is positive, so only rounding can reach this floor."""
 THINNEST = 1e-9
-"""A reported semi-axis is at least this fraction of the other: the filter itself lets an axis pass through zero."""
+"""A reported semi-axis is at least this fraction of the other: the filter itself lets an axis pass through zero. One
+that shrinks below this fraction within a scan, or crosses, sets `Status.FLOOR_USED`."""
 
 
 class MemEkfStarSettings(Settings):
@@ -162,8 +163,8 @@ def mem_ekf_star(params: Params, model: TrackingModel) -> Filter:
         spread = axes.congruence(extent_spread(state, model.extent_scale)) + model.sensor_noise
         info = innovation_info(state.kinematics.position, state.kinematics.position_cov, spread, scan)
         new = update(state, scan, model)
-        a, b = new.semi_axes.x, new.semi_axes.y
-        crossed = (a <= THINNEST * jnp.abs(b)) | (b <= THINNEST * jnp.abs(a))
+        size = jnp.max(jnp.abs(jnp.stack([new.semi_axes.array(), state.semi_axes.array()])))
+        crossed = (new.semi_axes.array() <= THINNEST * size).any()
         status = info.status | jnp.where(crossed, int(Status.FLOOR_USED), 0)
         return new, info._replace(status=status)
 

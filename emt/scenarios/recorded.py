@@ -121,12 +121,14 @@ def _scans_from_csv(path: Path, data: bytes) -> list[np.ndarray]:
     frames = table["frame"].to_numpy()
     if table.empty or not np.isfinite(frames).all() or (frames != np.round(frames)).any():
         raise DataError(f"'{path}': column 'frame' must hold whole numbers")
-    numbers, first = frames.astype(np.int64), int(frames.min())
-    if int(frames.max()) - first > 10_000_000:
-        raise DataError(f"'{path}': frames run from {first} to {int(frames.max())}; that is too long")
+    first, last = int(frames.min()), int(frames.max())
+    if last - first > 10_000_000:
+        raise DataError(f"'{path}': frames run from {first} to {last}; that is too long")
+    # counted from the first frame: frame numbers themselves may be beyond the machine's integers
+    numbers = (frames - frames.min()).astype(np.int64)
     points = table[["x", "y"]].to_numpy(np.float64)
     order = np.argsort(numbers, kind="stable")
-    counts = np.bincount(numbers - first)
+    counts = np.bincount(numbers)
     return np.split(points[order], np.cumsum(counts)[:-1])
 
 

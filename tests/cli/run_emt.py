@@ -31,6 +31,10 @@ def start_emt(*arguments: str, cwd: Path, cache: Path) -> subprocess.Popen:
     code = "import sys; from emt.cli.main import main; sys.argv[0] = 'emt'; main()"
     environment = os.environ | {"EMT_CACHE": str(cache)}
     return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)], cwd=cwd, env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-c", code, *map(str, arguments)],
+        cwd=cwd,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     )

@@ -88,9 +88,10 @@ def test_more_extends_without_computing_again(tmp_path, capsys):
     assert emt(capsys, "run", config, "--out", whole).code == 0
     other = json.loads((whole / "summary.json").read_text())
     assert other["filters"]["feldmann"]["gw"] == summary["filters"]["feldmann"]["gw"]
-    ours, theirs = (np.concatenate(
-        [reader.read_chunk(c)["feldmann/values"] for c in reader.chunks()]
-    ) for reader in (read_folder(out), read_folder(whole)))
+    ours, theirs = (
+        np.concatenate([reader.read_chunk(c)["feldmann/values"] for c in reader.chunks()])
+        for reader in (read_folder(out), read_folder(whole))
+    )
     np.testing.assert_array_equal(ours, theirs)
 
 

@@ -198,6 +198,15 @@ def test_gross_innovation_starts_at_ten_standard_deviations(distance, gross):
     assert bool(int(info.status) & Status.GROSS_INNOVATION) is gross
 
 
+def test_gross_innovation_is_seen_where_the_distance_is_not_a_number():
+    """Infinity minus infinity."""
+    spread = Sym2(1.0, 0.9, 1.0)
+    info = innovation_info(
+        Vec2(jnp.asarray(0.0), jnp.asarray(0.0)), spread, spread, scan_of([[1e200, 1e200]])
+    )
+    assert int(info.status) == Status.GROSS_INNOVATION
+
+
 def test_padding_of_a_scan():
     scan = as_scan(jnp.ones((3, 2)), capacity=5)
     assert scan.points.shape == (5, 2)

@@ -45,9 +45,7 @@ def estimate_of(e, velocity=(0.0, 0.0), cov=None) -> Estimate:
 
 def truth_of(e, velocity=(0.0, 0.0)) -> Truth:
     x, y, a, b, angle = map(float, e)
-    return Truth(
-        jnp.array([x, y]), jnp.array(velocity, float), Ellipse(jnp.array([a, b]), jnp.asarray(angle))
-    )
+    return Truth(jnp.array([x, y]), jnp.array(velocity, float), Ellipse(jnp.array([a, b]), jnp.asarray(angle)))
 
 
 def matrix(e):
@@ -78,9 +76,7 @@ def test_wasserstein_against_fifty_digits(golden):
     for pair in pairs:
         e1, e2 = pair["e1"], pair["e2"]
         scale = np.sum((np.array(e1[:2]) - e2[:2]) ** 2) + np.trace(matrix(e1)) + np.trace(matrix(e2))
-        assert abs(float(gw_squared(estimate_of(e1), truth_of(e2))) - pair["gw_squared"]) <= 1e-14 * scale, (
-            pair["kind"]
-        )
+        assert abs(float(gw_squared(estimate_of(e1), truth_of(e2))) - pair["gw_squared"]) <= 1e-14 * scale, pair["kind"]
 
 
 @given(ELLIPSE)
@@ -115,9 +111,7 @@ def test_kinematic_errors():
     )
     assert float(position_error_squared(estimate, truth)) == 25.0
     assert float(velocity_error_squared(estimate, truth)) == 25.0
-    assert float(orientation_error_squared_deg(estimate, truth)) == pytest.approx(
-        np.degrees(0.1) ** 2, rel=1e-12
-    )
+    assert float(orientation_error_squared_deg(estimate, truth)) == pytest.approx(np.degrees(0.1) ** 2, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -132,9 +126,7 @@ def test_orientation_raw_and_wrapped(axes, angle, raw, wrapped):
     """Raw differences are not wrapped; wrapped ones are between the longer axes, modulo half a turn."""
     estimate, truth = estimate_of((0.0, 0.0, *axes, angle)), truth_of((0.0, 0.0, 2.0, 1.0, 0.0))
     assert float(orientation_error_squared_deg(estimate, truth)) == pytest.approx(raw**2, rel=1e-9)
-    assert np.sqrt(float(wrapped_orientation_error_squared_deg(estimate, truth))) == pytest.approx(
-        wrapped, abs=1e-9
-    )
+    assert np.sqrt(float(wrapped_orientation_error_squared_deg(estimate, truth))) == pytest.approx(wrapped, abs=1e-9)
 
 
 @given(st.integers(0, 10_000))
@@ -148,9 +140,7 @@ def test_nees_is_the_quadratic_form(seed):
     assert float(nees(estimate, truth_of((0.0, 0.0, 1.0, 1.0, 0.0)))) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "e", [(0.0, 0.0, 6.0, 2.5, 0.4), (5.0, -3.0, 2.0, 2.0, 0.0), (0.0, 0.0, 1.0, 3.0, 2.0)]
-)
+@pytest.mark.parametrize("e", [(0.0, 0.0, 6.0, 2.5, 0.4), (5.0, -3.0, 2.0, 2.0, 0.0), (0.0, 0.0, 1.0, 3.0, 2.0)])
 def test_outline_of_an_ellipse_stands_for_that_ellipse(e):
     """As a star-convex shape about its own centre, and about another point inside it."""
     _, _, a, b, angle = e
@@ -165,9 +155,7 @@ def test_outline_of_an_ellipse_stands_for_that_ellipse(e):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         np.testing.assert_allclose(np.asarray(offset), turn @ -np.array(inside), atol=1e-9)
         ours = reference.extent_matrix(float(found.orientation), np.asarray(found.semi_axes))
-        np.testing.assert_allclose(
-            ours, reference.extent_matrix(angle, np.array([a, b])), rtol=1e-9, atol=1e-9
-        )
+        np.testing.assert_allclose(ours, reference.extent_matrix(angle, np.array([a, b])), rtol=1e-9, atol=1e-9)
         # so every metric sees the ellipse
         centre = np.array(e[:2]) + turn @ np.array(inside)
         shape = StarConvex(jnp.asarray(radii), jnp.asarray(angle))
@@ -187,9 +175,7 @@ def test_intersection_over_union():
     one = (0.0, 0.0, 3.0, 1.0, 0.3)
     assert float(overlap(estimate_of(one), truth_of(one))) == pytest.approx(1.0, abs=1e-12)
     assert float(overlap(estimate_of(one), truth_of((50.0, 0.0, 3.0, 1.0, 0.3)))) == 0.0
-    assert float(overlap(estimate_of((0.0, 0.0, 1.5, 0.5, 0.3)), truth_of(one))) == pytest.approx(
-        0.25, rel=1e-12
-    )
+    assert float(overlap(estimate_of((0.0, 0.0, 1.5, 0.5, 0.3)), truth_of(one))) == pytest.approx(0.25, rel=1e-12)
     assert float(overlap(estimate_of((0.0, 0.0, 1.0, 3.0, 0.3 + np.pi / 2)), truth_of(one))) == pytest.approx(
         1.0, abs=1e-12
     )

@@ -37,8 +37,6 @@ def test_fixed_noise_keeps_the_given_matrix(cov):
     noise = FixedNoise.of(cov)
     for dt in (0.1, 10.0):
         built = noise(jnp.asarray(dt))
-        np.testing.assert_allclose(
-            np.asarray(built.array()), cov, rtol=0.0, atol=1e-14 * max(1.0, np.abs(cov).max())
-        )
+        np.testing.assert_allclose(np.asarray(built.array()), cov, rtol=0.0, atol=1e-14 * max(1.0, np.abs(cov).max()))
     rest = np.asarray(noise.noise.velocity.array())
     assert np.linalg.eigvalsh(rest).min() >= -1e-13 * max(1.0, np.abs(cov).max())

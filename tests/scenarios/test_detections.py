@@ -80,9 +80,7 @@ def test_unit_disc_is_inside_the_circle():
     assert np.hypot(*points.T).max() <= 1.0
 
 
-@pytest.mark.parametrize(
-    "noise", [((0.0, 0.0), (0.0, 4.0)), ((4.0, 2.0), (2.0, 1.0)), ((0.0, 0.0), (0.0, 0.0))]
-)
+@pytest.mark.parametrize("noise", [((0.0, 0.0), (0.0, 4.0)), ((4.0, 2.0), (2.0, 1.0)), ((0.0, 0.0), (0.0, 0.0))])
 def test_singular_noise_has_a_factor(noise):
     factor = params_of(settings_of({"kind": "fixed", "count": 1}, noise=noise)).noise_chol
     matrix = np.array([[factor.xx, factor.xy], [factor.yx, factor.yy]])
@@ -131,9 +129,9 @@ def test_longer_tracks_extend_shorter_ones():
     settings = settings_of({"kind": "poisson", "mean": 5.0})
     params = jax.tree.map(jnp.asarray, params_of(settings))
     start = jax.tree.map(lambda leaf: leaf[:20], truth())
-    short = jax.jit(
-        lambda key: sample_scans(key, start, settings, params, 30), compiler_options=FAST_COMPILE
-    )(jax.random.key(0))
+    short = jax.jit(lambda key: sample_scans(key, start, settings, params, 30), compiler_options=FAST_COMPILE)(
+        jax.random.key(0)
+    )
     long = scans_of(settings, 30)
     np.testing.assert_allclose(np.asarray(short.points), long.points[:20], rtol=1e-14)
     np.testing.assert_array_equal(np.asarray(short.mask), long.mask[:20])

@@ -47,9 +47,7 @@ def test_published_trajectory():
     ])  # fmt: skip
     np.testing.assert_allclose(heading, expected, atol=1e-14)
     np.testing.assert_allclose(np.hypot(*truth.velocity.T), SPEED, rtol=1e-14)
-    np.testing.assert_allclose(
-        truth.velocity, SPEED * np.stack([np.cos(expected), np.sin(expected)], 1), atol=1e-12
-    )
+    np.testing.assert_allclose(truth.velocity, SPEED * np.stack([np.cos(expected), np.sin(expected)], 1), atol=1e-12)
     np.testing.assert_array_equal(truth.position[0], [0.0, 0.0])
     np.testing.assert_allclose(np.diff(truth.position, axis=0), 10.0 * truth.velocity[1:], atol=1e-10)
     np.testing.assert_array_equal(truth.ellipse.semi_axes, np.broadcast_to([170.0, 40.0], (103, 2)))
@@ -86,7 +84,5 @@ def test_truth_is_the_same_in_every_run_and_scans_are_not():
 def test_shipped_configuration_is_the_published_trajectory(name):
     text = (Path(__file__).parents[2] / "configs" / "tuncer2021" / name).read_text(encoding="utf-8")
     settings = TrajectorySettings.model_validate(YAML(typ="safe").load(text)["scenario"])
-    np.testing.assert_allclose(
-        headings_and_speeds(settings)[0], headings_and_speeds(settings_of())[0], atol=1e-9
-    )
+    np.testing.assert_allclose(headings_and_speeds(settings)[0], headings_and_speeds(settings_of())[0], atol=1e-9)
     np.testing.assert_allclose(headings_and_speeds(settings)[1], SPEED, rtol=1e-9)

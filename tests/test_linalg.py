@@ -132,8 +132,9 @@ def test_eigen_of_axis_parallel_matrices(xx, yy, direction):
 
 
 def test_small_eigenvalue_of_a_needle_keeps_its_digits():
-    """1 : 1000 in length is 1 : 1e6 in the matrix; half trace minus radius would lose six more digits."""
-    needle = Sym2.ellipse(jnp.asarray(1000.0), jnp.asarray(1.0), jnp.asarray(0.0))
+    """1 : 1e9 in length; half the trace minus the radius would be zero."""
+    needle = Sym2.ellipse(jnp.asarray(1e9), jnp.asarray(1.0), jnp.asarray(0.0))
+    needle = Sym2(needle.xx, needle.xy, jnp.asarray(1.0))
     assert float(needle.eigen()[1]) == pytest.approx(1.0, rel=1e-15)
 
 

@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from pydantic import Field, PositiveInt, TypeAdapter, ValidationError
 
 from emt import settings as s
-from emt.settings import Covariance, Matrix, Quantity, Settings, field_unit, to_si
+from emt.matrices import Covariance, Matrix
+from emt.settings import Quantity, Settings, field_unit
+from emt.units import to_si
 
 
 class Car(Settings):

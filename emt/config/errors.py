@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, 
 from pydantic import BaseModel, Discriminator, Tag, ValidationError
 
 from emt.registry import UnknownName, suggest
-from emt.settings import describe
+from emt.units import describe
 
 if TYPE_CHECKING:
     from emt.config.source import Source

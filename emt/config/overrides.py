@@ -7,7 +7,7 @@ from typing import Any
 
 from emt.config.errors import COMMAND_LINE, ConfigError, KeyPath, Problem, dotted
 from emt.config.source import Place, Source, parse_document
-from emt.settings import describe
+from emt.units import describe
 
 _NAME = re.compile(r"[^\s.\[\]=]+")
 _INDEX = re.compile(r"\[(\d{1,6})\]", re.ASCII)

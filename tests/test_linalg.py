@@ -93,13 +93,9 @@ def test_general_matrices(ours, theirs):
 def test_vectors():
     assert_close(over(lambda m, v: (Mat2.of(m) @ Vec2.of(v)).array(), M, V), np.einsum("nij,nj->ni", M, V))
     assert_close(over(lambda a, v: (Sym2.of(a) @ Vec2.of(v)).array(), A, V), np.einsum("nij,nj->ni", A, V))
-    assert_close(
-        over(lambda a, v: Sym2.of(a).quadratic(Vec2.of(v)), A, V), np.einsum("ni,nij,nj->n", V, A, V), 1e-10
-    )
+    assert_close(over(lambda a, v: Sym2.of(a).quadratic(Vec2.of(v)), A, V), np.einsum("ni,nij,nj->n", V, A, V), 1e-10)
     assert_close(over(lambda v: Vec2.of(v).outer().array(), V), V[:, :, None] * V[:, None, :])
-    assert_close(
-        over(lambda v, w: (Vec2.of(v) - 2.0 * Vec2.of(w) + Vec2.of(v)).array(), V, A[:, 0]), 2 * (V - A[:, 0])
-    )
+    assert_close(over(lambda v, w: (Vec2.of(v) - 2.0 * Vec2.of(w) + Vec2.of(v)).array(), V, A[:, 0]), 2 * (V - A[:, 0]))
 
 
 def test_congruence():
@@ -145,15 +141,11 @@ def test_small_eigenvalue_of_a_needle_keeps_its_digits():
 def test_ellipse_and_rotated_diagonal():
     a, b, angle = RNG.uniform(0.1, 10.0, N), RNG.uniform(0.1, 10.0, N), RNG.uniform(-7.0, 7.0, N)
     turn = over(lambda t: Mat2.rotation(t).array(), angle)
-    np.testing.assert_allclose(
-        turn @ np.swapaxes(turn, 1, 2), np.broadcast_to(np.eye(2), (N, 2, 2)), atol=1e-15
-    )
+    np.testing.assert_allclose(turn @ np.swapaxes(turn, 1, 2), np.broadcast_to(np.eye(2), (N, 2, 2)), atol=1e-15)
     np.testing.assert_allclose(turn[:, 1, 0], np.sin(angle), atol=1e-15)
     diagonal = np.stack([a, b], 1)[:, :, None] * np.eye(2)
     expected = turn @ diagonal @ np.swapaxes(turn, 1, 2)
-    built = over(
-        lambda a, b, t: rotated_diagonal(a, b, jnp.cos(2.0 * t), jnp.sin(2.0 * t)).array(), a, b, angle
-    )
+    built = over(lambda a, b, t: rotated_diagonal(a, b, jnp.cos(2.0 * t), jnp.sin(2.0 * t)).array(), a, b, angle)
     assert_close(built, expected)
     ellipse = over(lambda a, b, t: Sym2.ellipse(a, b, t).array(), np.sqrt(a), np.sqrt(b), angle)
     assert_close(ellipse, expected)

@@ -6,7 +6,10 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-import click
+import typer
+
+# typer carries its own copy of click, or uses an installed one, depending on its version
+UsageError: type = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 CHECK_FAILED = 1
 UNUSABLE = 2
@@ -44,15 +47,15 @@ def run_app(app: Callable[..., object], debug: bool) -> int:
     try:
         result = app(standalone_mode=False)
         return result if isinstance(result, int) else 0
-    except click.exceptions.Exit as stop:
+    except typer.Exit as stop:
         return stop.exit_code
-    except click.ClickException as error:
-        error.show()
+    except UsageError as error:
+        error.show()  # type: ignore[attr-defined]
         return UNUSABLE
     except InterruptedRunError as error:
         say(str(error))
         return CHECK_FAILED
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         say("interrupted")
         return CHECK_FAILED
     except BrokenPipeError:

@@ -121,3 +121,27 @@ def test_list_and_schema(capsys):
     schema = emt(capsys, "schema")
     assert schema.code == 0
     assert '"vb_random_matrix"' in schema.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rnu"], "No such command"),
+        (["run"], "Missing argument"),
+        (["run", "small", "--runs", "0"], "--runs"),
+        (["run", "small", "--sed", "1"], "No such option"),
+        (["reproduce", "--scale", "huge"], "--scale"),
+    ],
+)
+def test_a_mistake_in_the_command_is_named(capsys, arguments, message):
+    outcome = emt(capsys, *arguments)
+    assert outcome.code == 2
+    assert message in outcome.err
+
+
+def test_help_and_version_end_well(capsys):
+    assert emt(capsys, "--help").code == 0
+    shown = emt(capsys, "run", "--help")
+    assert shown.code == 0
+    assert "Example: emt run" in shown.out
+    assert emt(capsys, "--version").out.startswith("emt ")

@@ -205,9 +205,7 @@ def random_problem(
         position, velocity = position + dt[k] * velocity, velocity + 0.3 * rng.normal(size=2)
         heading += 0.05 * rng.normal()
         # one point, a full scan and an empty one in every sequence
-        n = {0: 1, 1: capacity, 2: 0 if empty else 2}.get(
-            k, int(rng.integers(0 if empty else 1, capacity + 1))
-        )
+        n = {0: 1, 1: capacity, 2: 0 if empty else 2}.get(k, int(rng.integers(0 if empty else 1, capacity + 1)))
         around = rng.uniform(0.0, 2.0 * np.pi, capacity)
         radius = np.sqrt(rng.uniform(size=capacity)) if case.source == "filled" else np.ones(capacity)
         body = radius[:, None] * axes * np.stack([np.cos(around), np.sin(around)], 1)
@@ -282,9 +280,7 @@ def mem_oracle(settings: MemEkfStarSettings, problem: Problem) -> Report:
     state = (prior.mean, prior.cov, shape, np.array(settings.shape_cov))
     rows = []
     for dt, y in zip(times, ragged(problem.scans), strict=True):
-        state = mem_ekf_star.predict(
-            *state, *textbook_motion(problem.model, dt), np.array(settings.shape_noise)
-        )
+        state = mem_ekf_star.predict(*state, *textbook_motion(problem.model, dt), np.array(settings.shape_noise))
         state = mem_ekf_star.update(*state, y, scale * np.eye(2), noise)
         angle, axes = mem_ekf_star.ellipse_read_out(state[2])
         rows.append((state[0], state[1], extent_matrices(axes, angle), angle))
@@ -308,9 +304,7 @@ def feldmann_oracle(settings: FeldmannSettings, problem: Problem) -> Report:
                 state = feldmann.predict_inverse_wishart_decay(*state, F, Q, settings.decay.factor)
         state = feldmann.update(*state, y, noise, scale)
         first = settings.read_out == "first_quadrant"
-        angle, axes = (
-            feldmann.gottingen_read_out(state[2]) if first else feldmann.major_axis_read_out(state[2])
-        )
+        angle, axes = feldmann.gottingen_read_out(state[2]) if first else feldmann.major_axis_read_out(state[2])
         rows.append((state[0], state[1], extent_matrices(axes, angle), angle))
     return _reports(rows)
 
@@ -371,9 +365,7 @@ MEM_COV = ((0.1, 0.02, -0.01), (0.02, 0.5, 0.05), (-0.01, 0.05, 0.2))
 MEM_NOISE = ((0.01, 0.001, 0.0), (0.001, 0.02, 0.004), (0.0, 0.004, 0.01))
 SURE = ((1e-12, 0.0, 0.0), (0.0, 1e-12, 0.0), (0.0, 0.0, 1e-12))
 STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-VB = VbRandomMatrixSettings(
-    shape=(12.0, 9.0), orientation_variance=0.1, orientation_noise=0.01, forgetting=0.97
-)
+VB = VbRandomMatrixSettings(shape=(12.0, 9.0), orientation_variance=0.1, orientation_noise=0.01, forgetting=0.97)
 GP = GpEttSettings(
     basis_angles=12, length_scale=0.6, orientation_variance=0.01, turn_rate_variance=1e-3,
     turn_acceleration_psd=1e-4, forgetting_rate=1e-3,

@@ -117,9 +117,7 @@ def test_guard_lets_a_sound_update_pass():
     assert int(info.status) == 0
 
 
-@pytest.mark.parametrize(
-    "scan", [scan_of([[0.0, 0.0]], [False]), scan_of([[np.nan, 0.0]])], ids=["empty", "screened"]
-)
+@pytest.mark.parametrize("scan", [scan_of([[0.0, 0.0]], [False]), scan_of([[np.nan, 0.0]])], ids=["empty", "screened"])
 def test_guard_ignores_updates_without_a_point(scan):
     flt = guarded(spoiling(updated=estimate_of(mean=[5.0, 6.0, 7.0, 8.0])))
     start = flt.init(PRIOR, KEY)
@@ -201,9 +199,7 @@ def test_gross_innovation_starts_at_ten_standard_deviations(distance, gross):
 def test_gross_innovation_is_seen_where_the_distance_is_not_a_number():
     """Infinity minus infinity."""
     spread = Sym2(1.0, 0.9, 1.0)
-    info = innovation_info(
-        Vec2(jnp.asarray(0.0), jnp.asarray(0.0)), spread, spread, scan_of([[1e200, 1e200]])
-    )
+    info = innovation_info(Vec2(jnp.asarray(0.0), jnp.asarray(0.0)), spread, spread, scan_of([[1e200, 1e200]]))
     assert int(info.status) == Status.GROSS_INNOVATION
 
 
@@ -220,8 +216,6 @@ def test_names_of_status_bits():
     """The values are stored in results, so they never change."""
     values = {"non-finite": 1, "not positive definite": 2, "diverged": 4, "measurement skipped": 8,
               "gross innovation": 16, "floor used": 32, "scan overflow": 64}  # fmt: skip
-    assert {
-        name: sum(flag for flag in Status if Status.names_of(flag) == [name]) for name in values
-    } == values
+    assert {name: sum(flag for flag in Status if Status.names_of(flag) == [name]) for name in values} == values
     assert Status.names_of(0) == []
     assert Status.names_of(3) == ["non-finite", "not positive definite"]

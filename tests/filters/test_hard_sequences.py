@@ -97,9 +97,7 @@ def scans_of(sequence: Sequence, source: str, seed: int):
     c, s = np.cos(sequence.angle), np.sin(sequence.angle)
     around = rng.uniform(0.0, 2.0 * np.pi, (STEPS, SLOTS))
     radius = np.sqrt(rng.uniform(size=(STEPS, SLOTS))) if source == "filled" else np.ones((STEPS, SLOTS))
-    body = np.stack(
-        [sequence.axes[0] * radius * np.cos(around), sequence.axes[1] * radius * np.sin(around)], -1
-    )
+    body = np.stack([sequence.axes[0] * radius * np.cos(around), sequence.axes[1] * radius * np.sin(around)], -1)
     xx, xy, yy = sequence.noise
     l11 = np.sqrt(xx)
     l21 = xy / l11 if l11 > 0.0 else 0.0

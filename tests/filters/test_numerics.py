@@ -73,9 +73,7 @@ def loss(estimate, info):
     """A smooth number that every part of the answer enters."""
     shape = jnp.concatenate([leaf.reshape(-1) for leaf in jax.tree.leaves(estimate.shape)])
     if isinstance(estimate.shape, Ellipse):
-        extent = jax.vmap(lambda e: Sym2.ellipse(e.semi_axes[0], e.semi_axes[1], e.orientation).array())(
-            estimate.shape
-        )
+        extent = jax.vmap(lambda e: Sym2.ellipse(e.semi_axes[0], e.semi_axes[1], e.orientation).array())(estimate.shape)
         shape = extent.reshape(-1)
     weights = jnp.cos(jnp.arange(shape.size, dtype=shape.dtype))
     return (
@@ -120,10 +118,7 @@ def test_gradients_are_finite_and_equal_finite_differences(case):
     ]
     values = np.asarray(jax.vmap(loss)(*batch_tracker(case)(stack(moved))))
     expected = (values[0::2] - values[1::2]) / (2.0 * step)
-    actual = [
-        sum(float((g * d).sum()) for g, d in zip(gradient, direction, strict=True))
-        for direction in directions
-    ]
+    actual = [sum(float((g * d).sum()) for g, d in zip(gradient, direction, strict=True)) for direction in directions]
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
@@ -188,9 +183,7 @@ def test_step_ten_thousand_is_as_sound_as_the_first(case):
     points = np.stack([6.0 * radius * np.cos(around), 2.5 * radius * np.sin(around)], -1)
     mask = np.arange(9) < n[:, None]
     scans = Measurements(jnp.asarray(points), jnp.asarray(mask), given.scans.overflow)
-    prior = Prior(
-        jnp.array([30.0, 0.0, 0.0, 0.6]), given.prior.cov, Ellipse(jnp.array([6.0, 3.0]), jnp.asarray(0.1))
-    )
+    prior = Prior(jnp.array([30.0, 0.0, 0.0, 0.6]), given.prior.cov, Ellipse(jnp.array([6.0, 3.0]), jnp.asarray(0.1)))
     mean, cov, smallest, status = map(np.asarray, long_track(case)(given._replace(scans=scans, prior=prior)))
     assert np.isfinite(mean).all()
     assert np.isfinite(cov).all()
@@ -225,9 +218,7 @@ def test_consistent_on_its_own_model(case):
         Q = psd * np.kron([[t**3 / 3.0, t**2 / 2.0], [t**2 / 2.0, t]], np.eye(2))
         state = state @ F.T + rng.normal(size=(runs, 4)) @ np.linalg.cholesky(Q).T
         truth.append(state)
-        points.append(
-            state[:, None, :2] + rng.normal(size=(runs, capacity, 2)) @ np.linalg.cholesky(spread).T
-        )
+        points.append(state[:, None, :2] + rng.normal(size=(runs, capacity, 2)) @ np.linalg.cholesky(spread).T)
     mask = np.arange(capacity) < rng.integers(0, capacity + 1, (runs, n_steps, 1))
     scans = cast(Measurements(np.stack(points, 1), mask, np.zeros((runs, n_steps), bool)), np.float64)
     shared = Problem(params, model, prior, None, jnp.asarray(dt))

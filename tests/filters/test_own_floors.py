@@ -47,9 +47,7 @@ def test_mem_reports_positive_axes(axes, reported):
     np.testing.assert_allclose(np.asarray(found), reported, rtol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("correlation", "crossed"), [(0.0, False), (0.9, True)], ids=["collapses", "crosses"]
-)
+@pytest.mark.parametrize(("correlation", "crossed"), [(0.0, False), (0.9, True)], ids=["collapses", "crosses"])
 def test_mem_says_that_an_axis_vanished(correlation, crossed):
     """Points at the centre under a wide prior shrink the axes to rounding level or past zero; the guard rests."""
     case = NAMED["mem_ekf_star"]
@@ -126,9 +124,7 @@ def test_feldmann_weight_stays_worth_one_point(rule):
         state = feldmann.forget(state, rule, jnp.asarray(0.8), DT)
     assert float(state.weight) == feldmann.MIN_WEIGHT
     grown = np.asarray(state.extent.array())
-    np.testing.assert_allclose(
-        np.asarray(feldmann.forget(state, rule, jnp.asarray(0.1), DT).extent.array()), grown
-    )
+    np.testing.assert_allclose(np.asarray(feldmann.forget(state, rule, jnp.asarray(0.1), DT).extent.array()), grown)
 
 
 def test_feldmann_weight_decays_towards_two():

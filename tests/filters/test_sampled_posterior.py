@@ -79,9 +79,7 @@ def test_known_shape_leaves_the_kalman_filter():
     spread = (SCALE * turn @ np.diag(AXES**2) @ turn.T + NOISE) / len(POINTS)
     H = np.hstack([np.eye(2), np.zeros((2, 2))])
     K = COV @ H.T @ np.linalg.inv(H @ COV @ H.T + spread)
-    np.testing.assert_allclose(
-        np.asarray(estimate.mean), MEAN + K @ (POINTS.mean(axis=0) - H @ MEAN), rtol=1e-4
-    )
+    np.testing.assert_allclose(np.asarray(estimate.mean), MEAN + K @ (POINTS.mean(axis=0) - H @ MEAN), rtol=1e-4)
     np.testing.assert_allclose(np.asarray(estimate.cov), COV - K @ H @ COV, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(np.asarray(estimate.shape.semi_axes), AXES, rtol=1e-4)
 

@@ -167,9 +167,7 @@ def test_other_units_change_only_the_numbers(case):
     )  # fmt: skip
     found = answer(case, changed)
     outline = length if case.source == "outline" else length**2
-    back = Report(
-        found.mean / unit, found.cov / np.outer(unit, unit), found.outline / outline, found.orientation
-    )
+    back = Report(found.mean / unit, found.cov / np.outer(unit, unit), found.outline / outline, found.orientation)
     assert_same(case, back, report(solved(case)[0]), case.tolerance)
 
 
@@ -178,9 +176,7 @@ def test_turning_the_world_turns_the_answer(case):
     """By any angle; VB starts its iteration with a matrix that is not turned, so by half a turn only (checked both)."""
     angles = [np.pi] if case.label == "vb_random_matrix" else [0.7, 2.5]
     for angle in angles:
-        assert_same(
-            case, turned_back(case, angle), in_world(case, report(solved(case)[0])), max(case.tolerance, 1e-8)
-        )
+        assert_same(case, turned_back(case, angle), in_world(case, report(solved(case)[0])), max(case.tolerance, 1e-8))
     if not case.turns:
         found = differences(case, turned_back(case, 0.7), in_world(case, report(solved(case)[0])))
         assert 1e-6 < max(found.values()) < 0.3, found

@@ -9,7 +9,7 @@ from pathlib import Path
 import typer
 
 # typer carries its own copy of click, or uses an installed one, depending on its version
-UsageError: type = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+UsageError: type[Exception] = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 CHECK_FAILED = 1
 UNUSABLE = 2

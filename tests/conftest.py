@@ -16,8 +16,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 def check_functions(fn):
     """Checks array shapes and dtypes at every call of a function or method.
 
-    Construction of dataclasses is left alone: those of parameters are pytrees, which hold plain numbers before they are
-    cast to arrays, and which JAX also builds with placeholder leaves.
+    Construction of dataclasses is left alone: those of parameters are pytrees, which hold plain numbers
+    before they are cast to arrays, and which JAX also builds with placeholder leaves.
     """
     return fn if fn.__name__ == "__init__" else beartype(fn)
 
@@ -39,7 +39,7 @@ hypothesis.settings.load_profile("emt")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiled programs are kept between test runs and shared by the workers; a damaged entry is compiled anew."""
+    """Compiled programs are kept between test runs and shared; a damaged entry is compiled anew."""
     if getattr(config, "cache", None) is not None:
         jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -57,7 +57,10 @@ def assert_close(actual, expected, tolerance=TIGHT):
         (lambda a, b: Sym2.of(a).full().array(), lambda a, b: a),
         (lambda a, b: (Sym2.of(a) @ Sym2.of(b)).array(), lambda a, b: a @ b),
         (lambda a, b: Sym2.of(a).inverse().array(), lambda a, b: np.linalg.inv(a)),
-        (lambda a, b: Sym2.of(a).adjugate().array(), lambda a, b: np.linalg.det(a)[:, None, None] * np.linalg.inv(a)),
+        (
+            lambda a, b: Sym2.of(a).adjugate().array(),
+            lambda a, b: np.linalg.det(a)[:, None, None] * np.linalg.inv(a),
+        ),
         (lambda a, b: Sym2.of(a).det(), lambda a, b: np.linalg.det(a)),
         (lambda a, b: Sym2.of(a).trace(), lambda a, b: np.trace(a, axis1=1, axis2=2)),
         (lambda a, b: Sym2.of(a).inner(Sym2.of(b)), lambda a, b: np.trace(a @ b, axis1=1, axis2=2)),
@@ -67,9 +70,21 @@ def assert_close(actual, expected, tolerance=TIGHT):
         ),
         (lambda a, b: fuse(Sym2.of(a), Sym2.of(b)).array(), lambda a, b: np.linalg.inv(np.linalg.inv(a) + b)),
     ],
-    ids=["sum", "difference", "scaled", "full", "product", "inverse", "adjugate", "det", "trace", "inner", "parallel",
-         "fuse"],
-)  # fmt: skip
+    ids=[
+        "sum",
+        "difference",
+        "scaled",
+        "full",
+        "product",
+        "inverse",
+        "adjugate",
+        "det",
+        "trace",
+        "inner",
+        "parallel",
+        "fuse",
+    ],
+)
 def test_symmetric_matrices(ours, theirs):
     assert_close(over(ours, A, B), theirs(A, B), 1e-10)
 
@@ -208,9 +223,15 @@ def test_factor_keeps_its_pivots_at_the_floor():
 
 @pytest.mark.parametrize(
     ("triangle", "expected"),
-    [((2.0, 1.0, 2.0), True), ((1.0, 1.0, 1.0), False), ((-1.0, 0.0, -1.0), False), ((np.nan, 0.0, 1.0), False),
-     ((np.inf, 0.0, 1.0), False), ((1.0, 0.0, 0.0), False)],
-)  # fmt: skip
+    [
+        ((2.0, 1.0, 2.0), True),
+        ((1.0, 1.0, 1.0), False),
+        ((-1.0, 0.0, -1.0), False),
+        ((np.nan, 0.0, 1.0), False),
+        ((np.inf, 0.0, 1.0), False),
+        ((1.0, 0.0, 0.0), False),
+    ],
+)
 def test_positive_definite(triangle, expected):
     assert bool(is_positive_definite(Sym2(*map(jnp.asarray, triangle)))) is expected
 

@@ -160,7 +160,7 @@ def report(estimate: Estimate) -> Report:
 
 
 def differences(case: Case, actual: Report, expected: Report) -> dict[str, float]:
-    """Largest difference of each reported quantity, relative to the largest size of that quantity at that step."""
+    """Largest difference of each quantity, relative to its largest entry at that step."""
 
     def relative(a, b, axes):
         scale = np.maximum(np.abs(b).max(axis=axes, keepdims=True), 1e-300)
@@ -260,9 +260,13 @@ def vb_oracle(settings: VbRandomMatrixSettings, problem: Problem) -> Report:
     prior, noise, scale, times = _world(problem)
     a = np.array(settings.shape)
     state = (
-        prior.mean, prior.cov, float(prior.ellipse.orientation), settings.orientation_variance,
-        a, (a - 1.0) * prior.ellipse.semi_axes**2,
-    )  # fmt: skip
+        prior.mean,
+        prior.cov,
+        float(prior.ellipse.orientation),
+        settings.orientation_variance,
+        a,
+        (a - 1.0) * prior.ellipse.semi_axes**2,
+    )
     rows = []
     for dt, y in zip(times, ragged(problem.scans), strict=True):
         F, Q = textbook_motion(problem.model, dt)
@@ -367,38 +371,60 @@ SURE = ((1e-12, 0.0, 0.0), (0.0, 1e-12, 0.0), (0.0, 0.0, 1e-12))
 STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 VB = VbRandomMatrixSettings(shape=(12.0, 9.0), orientation_variance=0.1, orientation_noise=0.01, forgetting=0.97)
 GP = GpEttSettings(
-    basis_angles=12, length_scale=0.6, orientation_variance=0.01, turn_rate_variance=1e-3,
-    turn_acceleration_psd=1e-4, forgetting_rate=1e-3,
-)  # fmt: skip
+    basis_angles=12,
+    length_scale=0.6,
+    orientation_variance=0.01,
+    turn_rate_variance=1e-3,
+    turn_acceleration_psd=1e-4,
+    forgetting_rate=1e-3,
+)
 
 
 def _feldmann(label: str, decay: dict, read_out: str, in_units=_same) -> Case:
     settings = FeldmannSettings(weight=9.0, decay=decay, read_out=read_out)
     known = FeldmannSettings(weight=1e12, decay={"kind": "weight", "factor": 1.0}, read_out=read_out)
     return Case(
-        label, settings, feldmann_oracle, in_units, unwrapped=False,
+        label,
+        settings,
+        feldmann_oracle,
+        in_units,
+        unwrapped=False,
         known_shape=known if decay["kind"] == "weight" else None,
-    )  # fmt: skip
+    )
 
 
 CASES = [
     Case(
-        "vb_random_matrix", VB, vb_oracle, _same, turns=False,
+        "vb_random_matrix",
+        VB,
+        vb_oracle,
+        _same,
+        turns=False,
         known_shape=VbRandomMatrixSettings(
             shape=(1e9, 1e9), orientation_variance=1e-9, orientation_noise=0.0, forgetting=1.0
         ),
     ),
     Case(
-        "mem_ekf_star", MemEkfStarSettings(shape_cov=MEM_COV, shape_noise=MEM_NOISE), mem_oracle, _mem_units,
-        order_free=False, known_shape=MemEkfStarSettings(shape_cov=SURE, shape_noise=STILL),
+        "mem_ekf_star",
+        MemEkfStarSettings(shape_cov=MEM_COV, shape_noise=MEM_NOISE),
+        mem_oracle,
+        _mem_units,
+        order_free=False,
+        known_shape=MemEkfStarSettings(shape_cov=SURE, shape_noise=STILL),
     ),
     _feldmann("feldmann", {"kind": "time_constant", "time": 20.0}, "major_axis", _time_constant_units),
     _feldmann("feldmann_weight", {"kind": "weight", "factor": 0.9}, "major_axis"),
     _feldmann("feldmann_inverse_wishart", {"kind": "inverse_wishart", "factor": 0.97}, "first_quadrant"),
     Case(
-        "gp_ett", GP, gp_oracle, _gp_units, tolerance=1e-6, source="outline", any_length_unit=False,
+        "gp_ett",
+        GP,
+        gp_oracle,
+        _gp_units,
+        tolerance=1e-6,
+        source="outline",
+        any_length_unit=False,
     ),
-]  # fmt: skip
+]
 """One row per filter and rule; see `Case`."""
 
 MAIN = [case for case in CASES if case.label in ("vb_random_matrix", "mem_ekf_star", "feldmann", "gp_ett")]

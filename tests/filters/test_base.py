@@ -26,9 +26,10 @@ def scan_of(points, mask=None, overflow=False) -> Measurements:
 
 def estimate_of(cov=None, shape=None, mean=None) -> Estimate:
     return Estimate(
-        jnp.zeros(4) if mean is None else jnp.asarray(mean), jnp.eye(4) if cov is None else jnp.asarray(cov),
+        jnp.zeros(4) if mean is None else jnp.asarray(mean),
+        jnp.eye(4) if cov is None else jnp.asarray(cov),
         Ellipse(jnp.array([2.0, 1.0]), jnp.asarray(0.0)) if shape is None else shape,
-    )  # fmt: skip
+    )
 
 
 def spoiling(updated=None, predicted=None, info=None) -> Filter:
@@ -50,14 +51,24 @@ def assert_equal(actual, expected):
 UNSOUND = {
     "mean not a number": (estimate_of(mean=[np.nan, 0.0, 0.0, 0.0]), Status.NON_FINITE),
     "infinite variance": (estimate_of(cov=np.diag([np.inf, 1.0, 1.0, 1.0])), Status.NON_FINITE),
-    "negative variance of position": (estimate_of(cov=np.diag([1.0, -1.0, 1.0, 1.0])), Status.NOT_POSITIVE_DEFINITE),
+    "negative variance of position": (
+        estimate_of(cov=np.diag([1.0, -1.0, 1.0, 1.0])),
+        Status.NOT_POSITIVE_DEFINITE,
+    ),
     "no variance of velocity": (estimate_of(cov=np.diag([1.0, 1.0, 0.0, 1.0])), Status.NOT_POSITIVE_DEFINITE),
     "semi-axis of zero": (
-        estimate_of(shape=Ellipse(jnp.array([1.0, 0.0]), jnp.asarray(0.0))), Status.NOT_POSITIVE_DEFINITE),
+        estimate_of(shape=Ellipse(jnp.array([1.0, 0.0]), jnp.asarray(0.0))),
+        Status.NOT_POSITIVE_DEFINITE,
+    ),
     "negative semi-axis": (
-        estimate_of(shape=Ellipse(jnp.array([-1.0, 1.0]), jnp.asarray(0.0))), Status.NOT_POSITIVE_DEFINITE),
-    "infinite radius": (estimate_of(shape=StarConvex(jnp.array([1.0, jnp.inf]), jnp.asarray(0.0))), Status.NON_FINITE),
-}  # fmt: skip
+        estimate_of(shape=Ellipse(jnp.array([-1.0, 1.0]), jnp.asarray(0.0))),
+        Status.NOT_POSITIVE_DEFINITE,
+    ),
+    "infinite radius": (
+        estimate_of(shape=StarConvex(jnp.array([1.0, jnp.inf]), jnp.asarray(0.0))),
+        Status.NON_FINITE,
+    ),
+}
 
 
 @pytest.mark.parametrize("name", UNSOUND)
@@ -99,10 +110,11 @@ def test_guard_looks_at_the_whole_state():
     """Also at numbers that are not reported."""
     inner = spoiling()
     hidden = Filter(
-        lambda prior, key: (inner.init(prior, key), jnp.asarray(1.0)), lambda state, dt, key: state,
+        lambda prior, key: (inner.init(prior, key), jnp.asarray(1.0)),
+        lambda state, dt, key: state,
         lambda state, scan, key: ((state[0], jnp.asarray(jnp.nan)), inner.update(state[0], scan, key)[1]),
         lambda state: state[0],
-    )  # fmt: skip
+    )
     flt = guarded(hidden)
     state, info = flt.update(flt.init(PRIOR, KEY), scan_of([[0.0, 0.0]]), KEY)
     assert float(state.state[1]) == 1.0
@@ -214,8 +226,15 @@ def test_padding_of_a_scan():
 
 def test_names_of_status_bits():
     """The values are stored in results, so they never change."""
-    values = {"non-finite": 1, "not positive definite": 2, "diverged": 4, "measurement skipped": 8,
-              "gross innovation": 16, "floor used": 32, "scan overflow": 64}  # fmt: skip
+    values = {
+        "non-finite": 1,
+        "not positive definite": 2,
+        "diverged": 4,
+        "measurement skipped": 8,
+        "gross innovation": 16,
+        "floor used": 32,
+        "scan overflow": 64,
+    }
     assert {name: sum(flag for flag in Status if Status.names_of(flag) == [name]) for name in values} == values
     assert Status.names_of(0) == []
     assert Status.names_of(3) == ["non-finite", "not positive definite"]

@@ -1,8 +1,8 @@
-"""Hard sequences: bad input, long gaps, extreme priors, noise, shapes and units, through every guarded filter.
+"""Hard sequences: bad input, gaps, extreme priors, noise, shapes and units, through every guarded filter.
 
-At every step all reported numbers are finite, covariances exactly symmetric and positive definite, semi-axes positive.
-Where the sequence has an answer, the last estimate is within 1,000 standard deviations of one measurement of the
-truth and nothing had to be kept back; where it has none, a status bit says so.
+At every step all reported numbers are finite, covariances exactly symmetric and positive definite, semi-axes
+positive. Where the sequence has an answer, the last estimate is within 1,000 standard deviations of one
+measurement of the truth and the guard did not act; where it has none, a status bit says so.
 """
 
 from dataclasses import dataclass, field
@@ -66,7 +66,7 @@ class Sequence:
 
 
 def settings_of(case: Case, which: str):
-    """Settings by name: usual, forgetful (of nearly everything at each step), or stubborn (sure of the prior shape)."""
+    """By name: usual, forgetful (of nearly everything at each step), or stubborn (sure of the shape)."""
     label = case.label
     if which == "usual" or (label == "gp_ett" and which == "stubborn"):
         return case.settings
@@ -219,7 +219,8 @@ SEQUENCES = [
     S("outlier in the last scan", corrupt=put(-1, 1e7), answer=False, flag=GROSS),
     S("outlier in every third scan", corrupt=put(slice(0, None, 3), 1e5), answer=False, flag=GROSS),
     S("outlier as the only point", counts=1, corrupt=put(8, 1e6), answer=False, flag=GROSS),
-    S("opposite outliers", corrupt=put(8, [[1e8, 1e8], [-1e8, -1e8]], slot=slice(0, 2)), answer=False, flag=GROSS),
+    S("opposite outliers", corrupt=put(8, [[1e8, 1e8], [-1e8, -1e8]], slot=slice(0, 2)), answer=False,
+      flag=GROSS),
     S("whole scan displaced", corrupt=shift_scans(8, 1e6), answer=False, flag=GROSS),
     S("object jumps", corrupt=shift_scans(slice(8, 14), 500.0), answer=False, flag=GROSS),
     # empty scans
@@ -286,7 +287,8 @@ SEQUENCES = [
     S("all points at the centre, huge axes", corrupt=at_centre, prior_axes=(60.0, 60.0)),
     S("all points of a scan equal", corrupt=same_point),
     S("one point for ever", corrupt=fixed_point, psd=1e-4, velocity=(0.0, 0.0)),
-    S("one point for ever, no noise", corrupt=fixed_point, psd=1e-4, velocity=(0.0, 0.0), noise=(1e-20, 0.0, 1e-20)),
+    S("one point for ever, no noise", corrupt=fixed_point, psd=1e-4, velocity=(0.0, 0.0),
+      noise=(1e-20, 0.0, 1e-20)),
     S("the same scan for ever", corrupt=shared_scan, velocity=(0.0, 0.0)),
     S("points on a line", corrupt=on_a_line),
     S("points on a line, no noise", corrupt=on_a_line, noise=(1e-16, 0.0, 1e-16)),

@@ -31,13 +31,15 @@ def test_prediction_is_the_textbook_one(dt, kind):
     """To 1e-12."""
     q = RNG.normal(size=(4, 4))
     noise = {
-        "white": WhiteAcceleration(jnp.asarray(0.3)), "none": WhiteAcceleration(jnp.asarray(0.0)),
+        "white": WhiteAcceleration(jnp.asarray(0.3)),
+        "none": WhiteAcceleration(jnp.asarray(0.0)),
         "fixed": FixedNoise.of(q @ q.T),
-    }[kind]  # fmt: skip
+    }[kind]
     Q = {
-        "white": 0.3 * np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.eye(2)), "none": np.zeros((4, 4)),
+        "white": 0.3 * np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.eye(2)),
+        "none": np.zeros((4, 4)),
         "fixed": q @ q.T,
-    }[kind]  # fmt: skip
+    }[kind]
     F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
     for _ in range(5):
         mean, cov = random_belief()

@@ -49,7 +49,7 @@ def test_mem_reports_positive_axes(axes, reported):
 
 @pytest.mark.parametrize(("correlation", "crossed"), [(0.0, False), (0.9, True)], ids=["collapses", "crosses"])
 def test_mem_says_that_an_axis_vanished(correlation, crossed):
-    """Points at the centre under a wide prior shrink the axes to rounding level or past zero; the guard rests."""
+    """Points at the centre under a wide prior shrink the axes to rounding level or past zero."""
     case = NAMED["mem_ekf_star"]
     wide = jnp.array([[0.1, 0.0, 0.0], [0.0, 100.0, 100.0 * correlation], [0.0, 100.0 * correlation, 100.0]])
     flt = case.build(mem_ekf_star.Params(wide, jnp.zeros((3, 3))), model_of(1e-4))

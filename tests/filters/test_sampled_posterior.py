@@ -55,9 +55,10 @@ def test_moments_agree_with_the_reference(ours):
         for seed in range(REPEATS)
     ]
     for found, expected in (
-        (estimate.mean, [t.x for t in theirs]), (estimate.cov, [t.P for t in theirs]),
+        (estimate.mean, [t.x for t in theirs]),
+        (estimate.cov, [t.P for t in theirs]),
         (matched.orientation, [t.theta for t in theirs]),
-    ):  # fmt: skip
+    ):
         found, expected = np.asarray(found), np.array(expected)
         error = np.sqrt((found.var(axis=0) + expected.var(axis=0)) / REPEATS) + 1e-9
         if found.ndim == 1:
@@ -68,7 +69,7 @@ def test_moments_agree_with_the_reference(ours):
 
 
 def test_known_shape_leaves_the_kalman_filter():
-    """With a prior that knows orientation and axes the posterior is that of a linear Gaussian model, up to 1e-4."""
+    """Where the prior knows orientation and axes, up to 1e-4."""
     flt = build((1e10, 1e10), 1e-12, 1000)
     key = jax.random.key(1)
     update = jax.jit(flt.update, compiler_options=FAST_COMPILE)

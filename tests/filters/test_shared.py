@@ -109,8 +109,11 @@ def one_step(case: Case):
 def test_empty_scan_returns_the_prediction_exactly(case, content):
     """Bit by bit, the whole state; also if the door takes every point out, which it says."""
     given = pick(problems(case), 4)
-    points = {"empty": given.scans.points[3], "nothing finite": jnp.full((9, 2), jnp.nan).at[:, 0].set(1.0),
-              "far too large": jnp.full((9, 2), -1e300)}[content]  # fmt: skip
+    points = {
+        "empty": given.scans.points[3],
+        "nothing finite": jnp.full((9, 2), jnp.nan).at[:, 0].set(1.0),
+        "far too large": jnp.full((9, 2), -1e300),
+    }[content]
     mask = jnp.zeros(9, bool) if content == "empty" else jnp.arange(9) < 4
     scan = Measurements(points, mask, jnp.asarray(False))
     predicted, updated, before, after, info = one_step(case)(given._replace(scans=scan, dt=given.dt[0]))
@@ -158,13 +161,15 @@ def test_other_units_change_only_the_numbers(case):
         jnp.asarray(unit * np.asarray(given.prior.mean)),
         jnp.asarray(np.outer(unit, unit) * np.asarray(given.prior.cov)),
         Ellipse(length * given.prior.ellipse.semi_axes, given.prior.ellipse.orientation),
-    )  # fmt: skip
+    )
     noise = type(model.noise)(length**2 / time**3 * model.noise.psd)
     changed = Problem(
         jax.vmap(lambda params: case.in_units(params, length, time))(given.params),
-        type(model)(noise, length**2 * model.sensor_noise, model.extent_scale), prior,
-        given.scans._replace(points=length * given.scans.points), time * given.dt,
-    )  # fmt: skip
+        type(model)(noise, length**2 * model.sensor_noise, model.extent_scale),
+        prior,
+        given.scans._replace(points=length * given.scans.points),
+        time * given.dt,
+    )
     found = answer(case, changed)
     outline = length if case.source == "outline" else length**2
     back = Report(found.mean / unit, found.cov / np.outer(unit, unit), found.outline / outline, found.orientation)
@@ -173,7 +178,7 @@ def test_other_units_change_only_the_numbers(case):
 
 @every
 def test_turning_the_world_turns_the_answer(case):
-    """By any angle; VB starts its iteration with a matrix that is not turned, so by half a turn only (checked both)."""
+    """By any angle; VB starts from a matrix that is not turned, so by half a turn only (both checked)."""
     angles = [np.pi] if case.label == "vb_random_matrix" else [0.7, 2.5]
     for angle in angles:
         assert_same(case, turned_back(case, angle), in_world(case, report(solved(case)[0])), max(case.tolerance, 1e-8))
@@ -194,15 +199,17 @@ def turned_back(case: Case, angle: float) -> Report:
     matrix = turn.array()
     both = jnp.kron(jnp.eye(2), matrix)
     prior = Prior(
-        given.prior.mean @ both.T, both @ given.prior.cov @ both.T,
+        given.prior.mean @ both.T,
+        both @ given.prior.cov @ both.T,
         Ellipse(given.prior.ellipse.semi_axes, given.prior.ellipse.orientation + angle),
-    )  # fmt: skip
+    )
     model = given.model
     noise = jax.vmap(turn.congruence)(model.sensor_noise)
     changed = given._replace(
-        model=type(model)(model.noise, noise, model.extent_scale), prior=prior,
+        model=type(model)(model.noise, noise, model.extent_scale),
+        prior=prior,
         scans=given.scans._replace(points=given.scans.points @ matrix.T),
-    )  # fmt: skip
+    )
     found, both, matrix = answer(case, changed), np.asarray(both), np.asarray(matrix)
     outline = found.outline if case.source == "outline" else matrix.T @ found.outline @ matrix
     back = Report(found.mean @ both, both.T @ found.cov @ both, outline, found.orientation - angle)

@@ -117,11 +117,15 @@ def test_kinematic_errors():
 @pytest.mark.parametrize(
     ("axes", "angle", "raw", "wrapped"),
     [
-        ((2.0, 1.0), np.pi, 180.0, 0.0), ((2.0, 1.0), -2.0 * np.pi, 360.0, 0.0), ((1.0, 2.0), np.pi / 2, 90.0, 0.0),
-        ((2.0, 1.0), np.pi / 2, 90.0, 90.0), ((2.0, 1.0), 0.75 * np.pi, 135.0, 45.0), ((1.0, 2.0), 0.0, 0.0, 90.0),
+        ((2.0, 1.0), np.pi, 180.0, 0.0),
+        ((2.0, 1.0), -2.0 * np.pi, 360.0, 0.0),
+        ((1.0, 2.0), np.pi / 2, 90.0, 0.0),
+        ((2.0, 1.0), np.pi / 2, 90.0, 90.0),
+        ((2.0, 1.0), 0.75 * np.pi, 135.0, 45.0),
+        ((1.0, 2.0), 0.0, 0.0, 90.0),
         ((2.0, 1.0), 10.0 * np.pi + 0.1, 1800.0 + np.degrees(0.1), np.degrees(0.1)),
     ],
-)  # fmt: skip
+)
 def test_orientation_raw_and_wrapped(axes, angle, raw, wrapped):
     """Raw differences are not wrapped; wrapped ones are between the longer axes, modulo half a turn."""
     estimate, truth = estimate_of((0.0, 0.0, *axes, angle)), truth_of((0.0, 0.0, 2.0, 1.0, 0.0))
@@ -182,8 +186,19 @@ def test_intersection_over_union():
 
 
 def test_catalogue_is_complete_and_described():
-    names = {"gw", "gw_std", "gw_center_sq", "gw_extent_sq", "position_rmse", "velocity_rmse", "orientation_rmse_deg",
-             "orientation_rmse_deg_std", "orientation_rmse_wrapped_deg", "nees", "iou"}  # fmt: skip
+    names = {
+        "gw",
+        "gw_std",
+        "gw_center_sq",
+        "gw_extent_sq",
+        "position_rmse",
+        "velocity_rmse",
+        "orientation_rmse_deg",
+        "orientation_rmse_deg_std",
+        "orientation_rmse_wrapped_deg",
+        "nees",
+        "iou",
+    }
     assert names <= set(METRICS)
     for name, metric in METRICS.items():
         assert metric.name == name

@@ -24,14 +24,17 @@ def random_cov(rank: int) -> np.ndarray:
 @pytest.mark.parametrize(
     "cov",
     [
-        np.diag([100.0, 100.0, 1.0, 1.0]), random_cov(4), np.zeros((4, 4)), np.diag([0.0, 0.0, 1.0, 1.0]),
+        np.diag([100.0, 100.0, 1.0, 1.0]),
+        random_cov(4),
+        np.zeros((4, 4)),
+        np.diag([0.0, 0.0, 1.0, 1.0]),
         np.diag([1.0, 0.0, 0.0, 2.0]),
         # discrete white acceleration: position and velocity noise fully correlated
         np.kron([[0.25, 0.5], [0.5, 1.0]], np.diag([2.0, 3.0])),
         random_cov(2),
     ],
     ids=["diagonal", "full", "none", "velocity only", "one axis each", "fully correlated", "rank two"],
-)  # fmt: skip
+)
 def test_fixed_noise_keeps_the_given_matrix(cov):
     """Whatever the step; singular ones included, and without a variance below zero in the factors."""
     noise = FixedNoise.of(cov)

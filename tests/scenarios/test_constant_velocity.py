@@ -19,9 +19,16 @@ STEPS, DT, PSD, TURN = 4000, 0.7, 0.3, 0.02
 
 def settings_of(**changes) -> ConstantVelocitySettings:
     given = {
-        "dt": DT, "steps": STEPS, "position": (5.0, -3.0), "velocity": (10.0, 10.0), "orientation": 0.5,
-        "acceleration_psd": PSD, "orientation_noise": TURN, "semi_axes": (4.0, 2.0), "detections": DETECTIONS,
-    }  # fmt: skip
+        "dt": DT,
+        "steps": STEPS,
+        "position": (5.0, -3.0),
+        "velocity": (10.0, 10.0),
+        "orientation": 0.5,
+        "acceleration_psd": PSD,
+        "orientation_noise": TURN,
+        "semi_axes": (4.0, 2.0),
+        "detections": DETECTIONS,
+    }
     return ConstantVelocitySettings(**(given | changes))
 
 

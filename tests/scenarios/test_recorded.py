@@ -160,9 +160,10 @@ def test_variable_that_is_no_cell_array(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "bad", [np.zeros((3, 2)), np.array(["text"]), np.array([[1j, 1.0], [1.0, 2.0]]), np.zeros((2, 2, 2))],
+    "bad",
+    [np.zeros((3, 2)), np.array(["text"]), np.array([[1j, 1.0], [1.0, 2.0]]), np.zeros((2, 2, 2))],
     ids=["three rows", "text", "complex", "three dimensions"],
-)  # fmt: skip
+)
 def test_cells_of_another_layout(tmp_path, bad):
     array = cells(SCANS)
     array[0, 1] = bad
@@ -174,14 +175,20 @@ def test_cells_of_another_layout(tmp_path, bad):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("frame,x\n0,1\n", "no column y"), ("frame;x;y\n0;1;2\n", "no column"),
-        ("frame,x,y\n0,1,abc\n", "column 'y'"), ("frame,x,y\nfirst,1,2\n", "column 'frame'"),
-        ("frame,x,y\n0.5,1,2\n", "whole numbers"), ("frame,x,y\n,1,2\n", "whole numbers"), ("frame,x,y\n", ""),
-        ("", "not a readable CSV file"), ("frame,x,y\n0,1,2,3,4\n1,1\n1,2,3,4,5,6\n", ""),
-        ("frame,x,y\n0,1,2\n99999999999,1,2\n", "too long"), ("frame,x,y\n0,1,2\n1e300,1,2\n", "too long"),
+        ("frame,x\n0,1\n", "no column y"),
+        ("frame;x;y\n0;1;2\n", "no column"),
+        ("frame,x,y\n0,1,abc\n", "column 'y'"),
+        ("frame,x,y\nfirst,1,2\n", "column 'frame'"),
+        ("frame,x,y\n0.5,1,2\n", "whole numbers"),
+        ("frame,x,y\n,1,2\n", "whole numbers"),
+        ("frame,x,y\n", ""),
+        ("", "not a readable CSV file"),
+        ("frame,x,y\n0,1,2,3,4\n1,1\n1,2,3,4,5,6\n", ""),
+        ("frame,x,y\n0,1,2\n99999999999,1,2\n", "too long"),
+        ("frame,x,y\n0,1,2\n1e300,1,2\n", "too long"),
         ("frame,x,y\n0,True,2\n", "column 'x'"),
     ],
-)  # fmt: skip
+)
 def test_csv_files_that_cannot_be_used(tmp_path, text, expected):
     message = refusal(write_csv(tmp_path, text))
     assert "scans.csv" in message

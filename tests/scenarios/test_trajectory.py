@@ -18,15 +18,24 @@ PI = np.pi
 
 def settings_of(**changes) -> TrajectorySettings:
     given = {
-        "dt": 10.0, "speed": SPEED, "semi_axes": (170.0, 40.0),
+        "dt": 10.0,
+        "speed": SPEED,
+        "semi_axes": (170.0, 40.0),
         "legs": (
-            {"steps": 20, "heading": -PI / 4}, {"steps": 11, "heading": (-PI / 4, 0.0)}, {"steps": 10, "heading": 0.0},
-            {"steps": 11, "heading": (0.0, PI / 2)}, {"steps": 20, "heading": PI / 2},
-            {"steps": 11, "heading": (PI / 2, PI)}, {"steps": 20, "heading": PI},
+            {"steps": 20, "heading": -PI / 4},
+            {"steps": 11, "heading": (-PI / 4, 0.0)},
+            {"steps": 10, "heading": 0.0},
+            {"steps": 11, "heading": (0.0, PI / 2)},
+            {"steps": 20, "heading": PI / 2},
+            {"steps": 11, "heading": (PI / 2, PI)},
+            {"steps": 20, "heading": PI},
         ),
-        "detections": {"count": {"kind": "poisson", "mean": 20.0}, "source": "uniform",
-                       "noise_cov": ((200.0, 0.0), (0.0, 200.0))},
-    }  # fmt: skip
+        "detections": {
+            "count": {"kind": "poisson", "mean": 20.0},
+            "source": "uniform",
+            "noise_cov": ((200.0, 0.0), (0.0, 200.0)),
+        },
+    }
     return TrajectorySettings(**(given | changes))
 
 
@@ -36,15 +45,22 @@ def truth_of(settings: TrajectorySettings):
 
 
 def test_published_trajectory():
-    """103 scans; headings in steps of π/40 and π/20; 500/36 m/s; from the origin; the ellipse along the heading."""
+    """103 scans; turns in steps of π/40 and π/20; 500/36 m/s; from the origin; ellipse along the heading."""
     settings = settings_of()
     truth = truth_of(settings)
     heading = truth.ellipse.orientation
     assert settings.n_steps == len(heading) == 103
-    expected = np.concatenate([
-        np.full(20, -PI / 4), -PI / 4 + PI / 40 * np.arange(11), np.zeros(10), PI / 20 * np.arange(11),
-        np.full(20, PI / 2), PI / 2 + PI / 20 * np.arange(11), np.full(20, PI),
-    ])  # fmt: skip
+    expected = np.concatenate(
+        [
+            np.full(20, -PI / 4),
+            -PI / 4 + PI / 40 * np.arange(11),
+            np.zeros(10),
+            PI / 20 * np.arange(11),
+            np.full(20, PI / 2),
+            PI / 2 + PI / 20 * np.arange(11),
+            np.full(20, PI),
+        ]
+    )
     np.testing.assert_allclose(heading, expected, atol=1e-14)
     np.testing.assert_allclose(np.hypot(*truth.velocity.T), SPEED, rtol=1e-14)
     np.testing.assert_allclose(truth.velocity, SPEED * np.stack([np.cos(expected), np.sin(expected)], 1), atol=1e-12)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from emt.cli.errors import InterruptedRunError, UnusableError, say
+from emt.cli.errors import CHECK_FAILED, InterruptedRunError, UnusableError, say
 
 
 class TableFormat(StrEnum):
@@ -67,6 +67,10 @@ def run(
 
         typer.echo(estimates_table(read_folder(folder), frames=(1, 2, 5, 10, 20, 50, 100, 200, 500)).render("text"))
     say(f"results: {folder}")
+    lost = [label for label in summary["labels"] if summary["status"][label]["failed"] == summary["runs"]]
+    if lost:
+        say(f"no run survived for: {', '.join(lost)}")
+        raise typer.Exit(CHECK_FAILED)
 
 
 def run_shown(loaded, folder: Path, *, more: int = 0, runs: int | None = None):

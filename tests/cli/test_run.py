@@ -130,3 +130,21 @@ def test_replay_shows_the_run_of_the_table(done, capsys, tmp_path):
     gw = [float(line.split(",")[header.index("gw")]) for line in steps[1:]]
     assert np.mean(gw) == pytest.approx(stored[0], rel=1e-13)
     assert (tmp_path / "replay" / "small-run21.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_no_survivor_means_no_number_and_exit_1(tmp_path, capsys):
+    outcome = emt(
+        capsys,
+        "run",
+        write(tmp_path),
+        "divergence={position_error_above: 1 mm}",
+        "--out",
+        tmp_path / "out",
+        "--runs",
+        9,
+    )
+    assert outcome.code == 1
+    assert "no run survived for: feldmann" in outcome.err
+    assert "0/9" in outcome.out
+    gw = json.loads((tmp_path / "out" / "summary.json").read_text())["filters"]["feldmann"]["gw"]
+    assert gw == {"value": None, "se": None, "std": None, "median": None, "runs_used": 0}

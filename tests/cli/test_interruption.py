@@ -10,7 +10,7 @@ from tests.cli.run_emt import start_emt
 from tests.montecarlo.small import TEXT, write
 
 # many small chunks, so that moments fall within, between and after them
-MANY = TEXT.replace("runs: 40", "runs: 1280")
+MANY = TEXT.replace("runs: 40", "runs: 800")
 
 
 def results(folder):
@@ -44,10 +44,10 @@ def wait_for_chunks(folder, count, process):
 def test_the_same_command_continues_and_ends_with_the_same_bytes(tmp_path, undisturbed, stop):
     config, cache, expected = undisturbed
     out, moments = tmp_path / "out", random.Random(int(stop))
-    for _ in range(3):
+    for _ in range(2):
         present = len(list(out.glob("chunk-*.npz")))
         process = start_emt("run", config, "--out", out, cwd=tmp_path, cache=cache)
-        wait_for_chunks(out, present + moments.randint(1, 20), process)
+        wait_for_chunks(out, present + moments.randint(1, 12), process)
         time.sleep(moments.uniform(0.0, 0.01))
         before = {p.name for p in out.glob("chunk-*.npz")}
         process.send_signal(stop)

@@ -95,7 +95,11 @@ def with_inexact(tree, leaves):
     return jax.tree.map(lambda leaf: next(given) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf, tree)
 
 
-@main
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=[pytest.mark.slow] * (case.label != "vb_random_matrix")) for case in MAIN],
+    ids=str,
+)
 def test_gradients_are_finite_and_equal_finite_differences(case):
     """By every number of parameters, model, prior and scans; NaN in the padding, an empty scan on the way."""
     given = pick(problems(case), 2)

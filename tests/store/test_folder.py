@@ -71,7 +71,7 @@ def test_json_and_text(tmp_path):
         read_folder(tmp_path).read_json("table.tex")
 
 
-@pytest.mark.parametrize("name", ["../a.json", "/tmp/a.json", ".lock", "a/b.json", "", "a.json\n"])
+@pytest.mark.parametrize("name", ["../a.json", "/a.json", ".lock", "a/b.json", "", "a.json\n"])
 def test_names_stay_inside_the_folder(tmp_path, name):
     with RunFolder.open(tmp_path / "run", make_manifest()) as folder:
         for action in (lambda: folder.write_json(name, 1), lambda: folder.write_text(name, "")):

@@ -18,6 +18,7 @@ class Purpose(IntEnum):
     TRUTH = 0
     MEASUREMENTS = 1
     FILTER = 2
+    PRIOR = 3
 
 
 def run_key(seed: Int[Array, ""], run: Int[Array, ""]) -> PRNGKeyArray:

@@ -181,5 +181,8 @@ PositiveAngle = Annotated[float, Quantity("rad", gt=0)]
 PositiveAngleVariance = Annotated[float, Quantity("rad^2", gt=0)]
 ShapeParameter = Annotated[float, Quantity("1", gt=1)]  # of an inverse gamma that has a mean
 NoiseCovariance = Annotated[Matrix, Covariance(2, "m", semidefinite=True)]
+MomentCovariance = Annotated[Matrix, Covariance(3, "m^2")]  # image moments n11, n20, n02
+MomentNoise = Annotated[Matrix, Covariance(3, "m^2", semidefinite=True)]
+TurnRateVariance = Annotated[float, Quantity("rad^2/s^2", ge=0)]
 ShapeNoise = Annotated[Matrix, Covariance(3, ("rad", "m", "m"), semidefinite=True)]
 KinematicNoise = Annotated[Matrix, Covariance(4, ("m", "m", "m/s", "m/s"), semidefinite=True)]

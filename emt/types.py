@@ -58,6 +58,10 @@ class Prior(NamedTuple):
     """Position (m) and velocity (m/s): x, y, vx, vy."""
     cov: Float[Array, "4 4"]
     ellipse: Ellipse
+    turn_rate: Traced = 0.0
+    """Mean turn rate (rad/s), for filters that estimate it."""
+    turn_rate_var: Traced = 0.0
+    """Its variance (rad²/s²)."""
 
 
 class Estimate(NamedTuple):
@@ -67,6 +71,8 @@ class Estimate(NamedTuple):
     """Position (m) and velocity (m/s): x, y, vx, vy."""
     cov: Float[Array, "4 4"]
     shape: Ellipse | StarConvex
+    modes: dict[str, Scalar] | None = None
+    """Probability of each motion mode by name, for multiple-model filters."""
 
 
 class Info(NamedTuple):
@@ -88,6 +94,9 @@ class Filter(NamedTuple):
     """(state, seconds since the last step, key) -> predicted state."""
     update: Callable[[State, Measurements, PRNGKeyArray], tuple[State, Info]]
     estimate: Callable[[State], Estimate]
+    merge: Callable[[Float[Array, "n_modes"], tuple[State, ...]], State] | None = None
+    """(weights, states of filters of the same family) -> a state of this filter that stands for the mixture; filters
+    that have it can be modes of a multiple-model filter."""
 
 
 class Scenario(NamedTuple):

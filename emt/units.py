@@ -30,6 +30,10 @@ _MEANINGS = {
     "rad": ("an angle", "rad, deg"),
     "rad^2": ("an angle variance", "rad^2, deg^2"),
     "rad/s": ("a turn rate", "rad/s, deg/s"),
+    "rad^2/s^2": ("a turn rate variance", "rad^2/s^2, deg^2/s^2"),
+    "m^2/s^4": ("an acceleration variance", "m^2/s^4"),
+    "rad^2/s^4": ("a turn acceleration variance", "rad^2/s^4, deg^2/s^4"),
+    "m^4": ("a variance of moments", "m^4, cm^4"),
     "1/s": ("a rate", "Hz, s^-1"),
     "1/m^2": ("a density", "m^-2, km^-2"),
 }

@@ -2,7 +2,15 @@
 
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, StringConstraints, create_model
+from pydantic import (
+    AfterValidator,
+    Field,
+    NonNegativeInt,
+    PositiveInt,
+    StringConstraints,
+    create_model,
+    model_validator,
+)
 
 import emt.filters.catalogue
 import emt.metrics.catalogue
@@ -17,7 +25,10 @@ from emt.settings import (
     NoiseCovariance,
     PositiveFloat,
     PositiveLength,
+    Quantity,
     Settings,
+    TurnRate,
+    TurnRateVariance,
     Vector4,
 )
 
@@ -31,6 +42,7 @@ def known_metric(name: str) -> str:
     return name
 
 
+MomentValue = Annotated[float, Quantity("m^2")]
 MetricName = Annotated[str, AfterValidator(known_metric)]
 
 
@@ -85,8 +97,30 @@ class PriorSettings(Settings):
     """Position and velocity: x, y, vx, vy."""
     cov: Covariance4
     orientation: Angle = 0.0
-    semi_axes: tuple[PositiveLength, PositiveLength]
+    semi_axes: tuple[PositiveLength, PositiveLength] | None = None
     """The first lies along `orientation`."""
+    moments: tuple[MomentValue, MomentValue, MomentValue] | None = None
+    """The shape by its normalised centred moments n11, n20, n02 instead of semi-axes and orientation."""
+    turn_rate: TurnRate = 0.0
+    """Mean of the turn rate, for filters that estimate it."""
+    turn_rate_variance: TurnRateVariance = 0.0
+    drawn: bool = False
+    """Whether each run starts from a mean of its own, drawn from N(mean, cov), the same for all filters."""
+
+    @model_validator(mode="after")
+    def _one_shape(self):
+        if (self.semi_axes is None) == (self.moments is None):
+            raise ValueError("give the shape either by semi_axes or by moments")
+        if self.moments is not None:
+            n11, n20, n02 = self.moments
+            if not (n20 > 0.0 and n20 * n02 > n11 * n11):
+                raise ValueError(
+                    "moments: n11, n20, n02 are not those of an ellipse: n20, n02 and n20 n02 - n11² must be positive, "
+                    f"got {n20:g}, {n02:g} and {n20 * n02 - n11 * n11:g}"
+                )
+            if self.orientation != 0.0:
+                raise ValueError("orientation: the moments already give it")
+        return self
 
 
 class ModelSettings(Settings):
@@ -126,7 +160,7 @@ class Experiment(Settings):
     paper: str | None = None
     """Key of the paper whose numbers stand in experiments/PAPER/published.yaml."""
     title: str = ""
-    length_unit: Literal["m", "px"] = "m"
+    length_unit: Literal["m", "cm", "px"] = "m"
     """Unit of every bare length, for headings; lengths with a unit of their own are metres."""
     monte_carlo: MonteCarlo = MonteCarlo()
     scenario: union_of(SCENARIOS)  # type: ignore[valid-type]

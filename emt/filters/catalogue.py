@@ -1,5 +1,14 @@
 """Imports every filter of this package, which registers it under its kind."""
 
-from emt.filters import feldmann, gp_ett, mem_ekf_star, sampled_posterior, vb_random_matrix
+from emt.filters import (
+    feldmann,
+    gp_ett,
+    imm,
+    lan_li,
+    mem_ekf_star,
+    moment_ukf,
+    sampled_posterior,
+    vb_random_matrix,
+)
 
-__all__ = ["feldmann", "gp_ett", "mem_ekf_star", "sampled_posterior", "vb_random_matrix"]
+__all__ = ["feldmann", "gp_ett", "imm", "lan_li", "mem_ekf_star", "moment_ukf", "sampled_posterior", "vb_random_matrix"]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emt.config.experiment import Experiment
+from emt.config.experiment import Experiment, PriorSettings
 from emt.filters.base import TrackingModel, guarded
 from emt.keys import Purpose, filter_key, purpose_key, run_key
 from emt.linalg import Sym2
@@ -17,6 +17,7 @@ from emt.metrics.base import METRICS, Metric
 from emt.models.motion import FixedNoise, WhiteAcceleration
 from emt.montecarlo.run import Rules, Scores, Tracker, score
 from emt.registry import FILTERS, SCENARIOS
+from emt.shapes.moments import ellipse_of
 from emt.types import Ellipse, Measurements, Prior, Scenario, Traced, Truth
 
 
@@ -44,6 +45,17 @@ def cast(tree, dtype):
         return jnp.asarray(array, dtype if array.dtype.kind == "f" else array.dtype)
 
     return jax.tree.map(leaf, tree)
+
+
+def prior_of(settings: PriorSettings) -> Prior:
+    """The prior of a checked experiment."""
+    if settings.moments is None:
+        ellipse = Ellipse(jnp.asarray(settings.semi_axes), jnp.asarray(settings.orientation))
+    else:
+        n11, n20, n02 = settings.moments
+        ellipse = ellipse_of(Sym2(*(jnp.asarray(n) for n in (n20, n11, n02))))
+    mean, cov = jnp.asarray(settings.mean), jnp.asarray(settings.cov)
+    return Prior(mean, cov, ellipse, settings.turn_rate, settings.turn_rate_variance)
 
 
 @dataclass(frozen=True)
@@ -79,11 +91,7 @@ class Program:
                 Sym2.of(np.array(model.noise_cov)),
                 model.extent_scale,
             ),
-            Prior(
-                jnp.asarray(prior.mean),
-                jnp.asarray(prior.cov),
-                Ellipse(jnp.asarray(prior.semi_axes), jnp.asarray(prior.orientation)),
-            ),
+            prior_of(prior),
             np.inf if experiment.divergence is None else experiment.divergence.position_error_above,
         )
         built = {label: FILTERS.get(settings.kind).builder(settings) for label, settings in experiment.filters.items()}
@@ -108,10 +116,20 @@ class Program:
     def score_run(self, label: str, world, params, seed, run, scans: Measurements, target: Truth) -> Scores:
         """Scores of one filter in one run."""
         flt = guarded(self.make_filter[label](params, world.model))
-        tracker = Tracker(flt, world.prior, self.experiment.start_with == "predict")
+        tracker = Tracker(flt, self.prior_of_run(world.prior, seed, run), self.experiment.start_with == "predict")
         key = filter_key(run_key(seed, run), label)
         dt = self.make_scenario(world.scenario).dt
         return score(tracker, self.rules_for(label), target, scans, dt, key, world.position_limit)
+
+    def prior_of_run(self, prior: Prior, seed, run) -> Prior:
+        """What the filters are told in one run: the prior itself, or one with a mean drawn from it."""
+        if not self.experiment.model.prior.drawn:
+            return prior
+        draw = jax.random.normal(purpose_key(run_key(seed, run), Purpose.PRIOR), (5,), prior.mean.dtype)
+        return prior._replace(
+            mean=prior.mean + jnp.linalg.cholesky(prior.cov) @ draw[:4],
+            turn_rate=prior.turn_rate + jnp.sqrt(prior.turn_rate_var) * draw[4],
+        )
 
     def rules_for(self, label: str) -> Rules:
         """A reference filter is not compared with itself; it has no metrics."""

@@ -430,5 +430,5 @@ CASES = [
 MAIN = [case for case in CASES if case.label in ("vb_random_matrix", "mem_ekf_star", "feldmann", "gp_ett")]
 """One row per filter."""
 
-SAMPLED = {"sampled_posterior"}
-"""Filters that answer with Monte Carlo error; they have tests of their own."""
+ELSEWHERE = {"sampled_posterior", "moment_ukf", "lan_li", "imm"}
+"""Filters with files of tests of their own."""

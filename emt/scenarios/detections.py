@@ -43,8 +43,9 @@ class DetectionSettings(Settings):
     """Points per scan, their source on the object, and the sensor noise."""
 
     count: Annotated[PoissonCount | FixedCount, Field(discriminator="kind")]
-    source: Literal["uniform", "gaussian"]
-    """"uniform" over the filled ellipse, or "gaussian" with the extent (squared semi-axes) as covariance."""
+    source: Literal["uniform", "gaussian", "box"]
+    """"uniform" over the filled ellipse, "gaussian" with the extent (squared semi-axes) as covariance, or uniform in
+    the "box" whose smallest enclosing ellipse is the object's."""
     noise_cov: NoiseCovariance
     """Covariance of the Gaussian sensor noise of each point."""
     max_points: PositiveInt | None = None
@@ -114,6 +115,9 @@ def sample_scan(
     dtype = truth.position.dtype
     if settings.source == "uniform":
         source = unit_disc(source_key, capacity, dtype)
+    elif settings.source == "box":
+        side = math.sqrt(0.5)
+        source = jax.random.uniform(source_key, (capacity, 2), dtype, -side, side)
     else:
         source = jax.random.normal(source_key, (capacity, 2), dtype)
     noise = jax.random.normal(noise_key, (capacity, 2), dtype)

@@ -11,7 +11,7 @@ import emt.filters.catalogue  # noqa: F401 - registers the filters
 from emt.linalg import Mat2
 from emt.registry import FILTERS
 from emt.status import FAILURE, Status
-from emt.types import Ellipse, Measurements, Prior
+from emt.types import Ellipse, Measurements
 from tests.filters.cases import (
     CASES,
     ELSEWHERE,
@@ -157,10 +157,10 @@ def test_other_units_change_only_the_numbers(case):
     length, time = 7.3 if case.any_length_unit else 1.0, 0.19
     given, model = problems(case), problems(case).model
     unit = np.array([length, length, length / time, length / time])
-    prior = Prior(
-        jnp.asarray(unit * np.asarray(given.prior.mean)),
-        jnp.asarray(np.outer(unit, unit) * np.asarray(given.prior.cov)),
-        Ellipse(length * given.prior.ellipse.semi_axes, given.prior.ellipse.orientation),
+    prior = given.prior._replace(
+        mean=jnp.asarray(unit * np.asarray(given.prior.mean)),
+        cov=jnp.asarray(np.outer(unit, unit) * np.asarray(given.prior.cov)),
+        ellipse=Ellipse(length * given.prior.ellipse.semi_axes, given.prior.ellipse.orientation),
     )
     noise = type(model.noise)(length**2 / time**3 * model.noise.psd)
     changed = Problem(
@@ -198,10 +198,10 @@ def turned_back(case: Case, angle: float) -> Report:
     turn = Mat2.rotation(jnp.asarray(angle))
     matrix = turn.array()
     both = jnp.kron(jnp.eye(2), matrix)
-    prior = Prior(
-        given.prior.mean @ both.T,
-        both @ given.prior.cov @ both.T,
-        Ellipse(given.prior.ellipse.semi_axes, given.prior.ellipse.orientation + angle),
+    prior = given.prior._replace(
+        mean=given.prior.mean @ both.T,
+        cov=both @ given.prior.cov @ both.T,
+        ellipse=Ellipse(given.prior.ellipse.semi_axes, given.prior.ellipse.orientation + angle),
     )
     model = given.model
     noise = jax.vmap(turn.congruence)(model.sensor_noise)

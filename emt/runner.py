@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from emt.config.errors import ConfigError
@@ -19,7 +20,7 @@ from emt.reports.published import summary_table
 from emt.reports.replay import overview_table, steps_table
 from emt.reports.summary import SUMMARY_FILE, curves, summarise
 from emt.reports.table import Table
-from emt.scenarios.recorded import DataError
+from emt.scenarios.data import DataError
 from emt.status import FAILURE
 from emt.store import RunFolder
 
@@ -75,20 +76,22 @@ def build_program(loaded: Loaded) -> Program:
     try:
         return Program.of(loaded.experiment)
     except DataError as error:
-        raise ConfigError([problem_at(loaded.source, ("scenario", "path"), str(error))]) from error
+        raise ConfigError([problem_at(loaded.source, ("scenario", error.key), str(error))]) from error
 
 
 def metric_facts(program: Program) -> list[dict[str, Any]]:
-    """Name, unit, definition and averaging of the metrics, as plain data."""
-    return [{k: v for k, v in m._asdict().items() if k != "per_step"} for m in program.metrics]
+    """Name, unit, definition, averaging of the metrics, and the filters without it, as plain data."""
+    shown = ("name", "unit", "better", "definition", "over_time", "over_runs")
+    return [{name: getattr(m, name) for name in shown} | {"without": program.without(m)} for m in program.metrics]
 
 
 def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
     """What is recorded with results: the identity they depend on, and what readers need to show them."""
     identity, experiment = loaded.identity(), loaded.experiment
-    if not experiment.scenario.has_truth:
-        scans = program.world.scenario
-        digest = hashlib.sha256(np.asarray(scans.points).tobytes() + np.asarray(scans.mask).tobytes())
+    if hasattr(experiment.scenario, "path"):
+        digest = hashlib.sha256()
+        for leaf in jax.tree.leaves(program.world.scenario):
+            digest.update(np.asarray(leaf).tobytes())
         identity["recording_sha256"] = digest.hexdigest()
     return {
         "identity": identity,
@@ -99,6 +102,7 @@ def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
         "title": experiment.title,
         "length_unit": experiment.length_unit,
         "steps": program.n_steps,
+        "maneuvers": [list(interval) for interval in getattr(experiment.scenario, "maneuvers", ())],
         "has_truth": experiment.scenario.has_truth,
     }
 
@@ -184,7 +188,9 @@ def write_reports(folder: RunFolder, first_run: dict[str, np.ndarray]) -> dict[s
         folder.write_text("table.md", summary_table(summary, unit).render("markdown"))
         if manifest["steps"] > 1:
             scored = {label: curves(folder, label) for label in labels}
-            folder.write_bytes("over_time.png", over_time_figure(scored, metrics, length_unit=unit))
+            folder.write_bytes(
+                "over_time.png", over_time_figure(scored, metrics, unit, maneuvers=manifest["maneuvers"])
+            )
     if manifest["identity"]["config"]["traces"]:
         folder.write_text("estimates.csv", estimates_table(folder).render("csv"))
     if first_run:

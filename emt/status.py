@@ -13,6 +13,7 @@ class Status(IntFlag):
     GROSS_INNOVATION = 16
     FLOOR_USED = 32
     SCAN_OVERFLOW = 64
+    MOMENTS_PROJECTED = 128
 
     @classmethod
     def names_of(cls, bits: int) -> list[str]:

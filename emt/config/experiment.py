@@ -15,12 +15,13 @@ from pydantic import (
 import emt.filters.catalogue
 import emt.metrics.catalogue
 import emt.scenarios.catalogue  # noqa: F401  (these three fill the registries)
-from emt.metrics.base import METRICS
-from emt.registry import FILTERS, SCENARIOS, Entry, Registry, UnknownName, suggest
+from emt.metrics.base import find_metric
+from emt.registry import FILTERS, SCENARIOS, Entry, Registry
 from emt.settings import (
     AccelerationDensity,
     Angle,
     Covariance4,
+    Fraction,
     KinematicNoise,
     NoiseCovariance,
     PositiveFloat,
@@ -37,9 +38,7 @@ Label = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$"
 
 def known_metric(name: str) -> str:
     """The name of a metric, checked."""
-    if name not in METRICS:
-        raise UnknownName(name, sorted(METRICS), suggest(name, METRICS), "metric")
-    return name
+    return find_metric(name).name
 
 
 MomentValue = Annotated[float, Quantity("m^2")]
@@ -138,7 +137,16 @@ class ModelSettings(Settings):
 class Divergence(Settings):
     """When a run counts as lost, apart from numerical failure."""
 
-    position_error_above: PositiveLength
+    position_error_above: PositiveLength | None = None
+    """At any scan."""
+    final_iou_below: Fraction | None = None
+    """Intersection over union at the last scan."""
+
+    @model_validator(mode="after")
+    def _not_empty(self):
+        if self.position_error_above is None and self.final_iou_below is None:
+            raise ValueError("give position_error_above, final_iou_below or both")
+        return self
 
 
 class Sources(Settings):

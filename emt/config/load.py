@@ -28,8 +28,7 @@ class Loaded(NamedTuple):
         """Everything the results depend on, as plain data; the number of runs is not part of it."""
         config = self.experiment.model_dump(mode="json", exclude=set(NOT_RESULTS))
         run = config.pop("monte_carlo")
-        if config["scenario"]["kind"] == "recorded":
-            config["scenario"].pop("path")  # the recording is known by its hash
+        config["scenario"].pop("path", None)  # a recording is known by its content
         return {
             "experiment": self.name,
             "config": config,
@@ -118,7 +117,7 @@ def resolve_paths(experiment: Experiment, source: Source) -> Experiment:
     """A recording is looked for beside its configuration first, then from the working directory."""
     scenario = experiment.scenario
     given = getattr(scenario, "path", None)
-    if scenario.kind != "recorded" or given is None:
+    if given is None:
         return experiment
     beside = Path(source.path).parent / given
     found = beside if beside.is_file() else Path(given)

@@ -15,6 +15,7 @@ from emt.filters.lan_li import LanLiSettings
 from emt.filters.moment_ukf import MomentUkfSettings
 from emt.registry import FILTERS
 from emt.settings import Fraction, Settings
+from emt.status import Status
 from emt.types import Estimate, Filter, Info, Measurements, Prior, Scalar, State
 
 ModeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
@@ -108,9 +109,11 @@ def imm(names: tuple[str, ...], modes: tuple[Filter, ...], params: Params, avera
         total = logsumexp(joint)
         posterior = joint - total
         nis = (jnp.exp(posterior) * jnp.stack([info.nis for info in infos])).sum()
-        status = infos[0].status
+        every = any_ = infos[0].status
         for info in infos[1:]:
-            status = status & info.status  # a scan is gross only if no mode expects it
+            every, any_ = every & info.status, any_ | info.status
+        gross = int(Status.GROSS_INNOVATION)  # a scan is gross only if no mode expects it
+        status = (any_ & ~gross) | (every & gross)
         return ImmState(posterior, tuple(new for new, _ in results)), Info(total, nis, status)
 
     def estimate(state: ImmState) -> Estimate:

@@ -6,11 +6,11 @@ from typing import Annotated, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from pydantic import Field, model_validator
 
 from emt.filters.base import TrackingModel, innovation_info, keep_if
-from emt.filters.moment_update import Projection, augmented_update, expected, moments_in, point_update
+from emt.filters.moment_update import Projection, augmented_update, expected, moments_in, point_update, projected
 from emt.filters.unscented import Gaussian, Spread, merge_gaussians, product, square_root
 from emt.linalg import Sym2, Vec2
 from emt.models.motion import WhiteAcceleration
@@ -27,6 +27,7 @@ from emt.settings import (
     UnitInterval,
 )
 from emt.shapes.moments import ellipse_of, moments_of
+from emt.status import Status
 from emt.types import Estimate, Filter, Measurements, Prior, Scalar, Traced
 
 KINEMATIC = jnp.array([3, 5, 4, 6])
@@ -154,17 +155,21 @@ def predict_turn(belief: Gaussian, dt: Scalar, params: Params) -> Gaussian:
     return Gaussian(center + bend, square_root(cov))
 
 
-def update(belief: Gaussian, scan: Measurements, model: TrackingModel, params: Params, augmented: bool) -> Gaussian:
-    """Sequential update by the points of a scan in their order."""
+def update(
+    belief: Gaussian, scan: Measurements, model: TrackingModel, params: Params, augmented: bool
+) -> tuple[Gaussian, Bool[Array, ""]]:
+    """Sequential update by the points of a scan in their order, and whether a mean had to be projected."""
     one = augmented_update if augmented else point_update
 
-    def body(j, now):
+    def body(j, carry):
+        now, before = carry
         point = Vec2(scan.points[j, 0], scan.points[j, 1])
-        return keep_if(scan.mask[j], one(now, point, model.sensor_noise, params.spread, params.projection), now)
+        new, acted = projected(one(now, point, model.sensor_noise, params.spread, params.projection), params.projection)
+        return keep_if(scan.mask[j], (new, before | acted), carry)
 
     slots = jnp.arange(scan.mask.shape[0])
     last = jnp.where(scan.mask, slots + 1, 0).max()  # padding at the end costs nothing
-    return jax.lax.fori_loop(0, last, body, belief)
+    return jax.lax.fori_loop(0, last, body, (belief, jnp.asarray(False)))
 
 
 def log_likelihood(belief: Gaussian, scan: Measurements, model: TrackingModel, params: Params) -> Scalar:
@@ -212,8 +217,9 @@ def moment_ukf(turning: bool, augmented: bool, params: Params, model: TrackingMo
         spread = moments_in(belief.mean, params.projection) + model.sensor_noise
         info = innovation_info(position, Sym2.of(cov), spread, scan)
         likelihood = log_likelihood(belief, scan, model, params)
-        new = update(belief, scan, model, params, augmented)
-        return new, info._replace(log_likelihood=likelihood)
+        new, acted = update(belief, scan, model, params, augmented)
+        status = info.status | jnp.where(acted, int(Status.MOMENTS_PROJECTED), 0)
+        return new, info._replace(log_likelihood=likelihood, status=status)
 
     def estimate(belief: Gaussian) -> Estimate:
         cov = product(belief.root[KINEMATIC])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from emt.filters.unscented import Gaussian, Spread, product, scalar_update, square_root
 from emt.linalg import Sym2, Vec2
@@ -87,22 +87,16 @@ def expected(belief: Gaussian, point: Vec2, noise: Sym2, spread: Spread, project
     return Expected(center + bend - noise_mean - SCALE_MEAN, variance, cross)
 
 
-def with_moments(mean: Float[Array, "n"], moments: Sym2) -> Float[Array, "n"]:
-    """The mean with other moments."""
-    return mean.at[:3].set(jnp.stack([moments.xy, moments.xx, moments.yy]))
-
-
 def point_update(belief: Gaussian, point: Vec2, noise: Sym2, spread: Spread, projection: Projection | None) -> Gaussian:
-    """Update by one point in closed form."""
+    """Update by one point in closed form; the new mean is not projected."""
     now = expected(belief, point, noise, spread, projection)
-    belief = scalar_update(belief, now.cross, -now.mean, now.variance)
-    return belief._replace(mean=with_moments(belief.mean, moments_in(belief.mean, projection)))
+    return scalar_update(belief, now.cross, -now.mean, now.variance)
 
 
 def augmented_update(
     belief: Gaussian, point: Vec2, noise: Sym2, spread: Spread, projection: Projection | None
 ) -> Gaussian:
-    """Update by one point as printed: sigma points of (p, s², f), weighted moments, then a Cholesky factor."""
+    """The same as printed: sigma points of (p, s², f), weighted moments, then a Cholesky factor."""
     n = belief.mean.shape[0]
     noise_mean, noise_variance = noise_moments(belief.mean, point, noise, projection)
     mean = jnp.concatenate([belief.mean, jnp.stack([jnp.asarray(SCALE_MEAN, noise_mean.dtype), noise_mean])])
@@ -121,5 +115,11 @@ def augmented_update(
     variance = (cov_weights * gaps * gaps).sum()
     gain = ((cov_weights * gaps)[None, :] * (sigma[:n] - belief.mean[:, None])).sum(axis=1) / variance
     cov = product(belief.root) - variance * gain[:, None] * gain[None, :]
-    updated = belief.mean - gain * predicted
-    return Gaussian(with_moments(updated, moments_in(updated, projection)), square_root(cov, jitter=0.0))
+    return Gaussian(belief.mean - gain * predicted, square_root(cov, jitter=0.0))
+
+
+def projected(belief: Gaussian, projection: Projection | None) -> tuple[Gaussian, Bool[Array, ""]]:
+    """The belief with its mean moments projected, and whether that changed them."""
+    moments = moments_in(belief.mean, projection)
+    new = jnp.stack([moments.xy, moments.xx, moments.yy])
+    return belief._replace(mean=belief.mean.at[:3].set(new)), (new != belief.mean[:3]).any()

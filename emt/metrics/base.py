@@ -1,9 +1,11 @@
 """What a metric is, and the catalogue of all metrics by name."""
 
+import re
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from emt.types import Estimate, Scalar, Truth
+from emt.registry import UnknownName, suggest
+from emt.types import Estimate, Info, Scalar, Truth
 
 
 class Metric(NamedTuple):
@@ -22,16 +24,46 @@ class Metric(NamedTuple):
     """Unit of the value; `L` stands for the experiment's length unit."""
     better: Literal["lower", "higher", "neither"]
     definition: str
-    per_step: Callable[[Estimate, Truth], Scalar]
+    per_step: Callable[[Estimate, Truth, Info], Scalar]
     over_time: Literal["mean", "rms"] = "mean"
     over_runs: Literal["mean", "std", "rms"] = "mean"
+    smooth: str | None = None
+    """Metric that `emt tune` follows in its place where it needs a gradient; by default itself."""
+    needs_mode: str | None = None
+    """Only filters with this mode have the metric."""
+
+    def applies_to(self, estimate: Estimate) -> bool:
+        """Whether a filter that reports such estimates has the metric."""
+        return self.needs_mode is None or self.needs_mode in (estimate.modes or {})
+
+
+def of_truth(function: Callable[[Estimate, Truth], Scalar]) -> Callable[[Estimate, Truth, Info], Scalar]:
+    """`per_step` of a metric that needs no diagnostics of the update."""
+    return lambda estimate, truth, info: function(estimate, truth)
 
 
 METRICS: dict[str, Metric] = {}
-"""All metrics, by the names used in configurations and tables."""
+"""All metrics with a fixed name, by the names used in configurations and tables."""
+FAMILIES: dict[str, Callable[[str], Metric]] = {}
+"""Metrics with a name inside their name, written NAME: `mode_NAME_probability`."""
 
 
 def register(metric: Metric) -> Metric:
     """Adds a metric to the catalogue."""
     METRICS[metric.name] = metric
     return metric
+
+
+def find_metric(name: str) -> Metric:
+    """The metric of that name.
+
+    Raises:
+        UnknownName: there is none.
+    """
+    if name in METRICS:
+        return METRICS[name]
+    for pattern, make in FAMILIES.items():
+        if found := re.fullmatch(pattern.replace("NAME", "([A-Za-z][A-Za-z0-9_]*)"), name):
+            return make(found[1])
+    known = sorted({*METRICS, *FAMILIES})
+    raise UnknownName(name, known, suggest(name, known), "metric")

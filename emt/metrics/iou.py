@@ -1,6 +1,6 @@
 """Intersection over union of true and estimated outline."""
 
-from emt.metrics.base import Metric, register
+from emt.metrics.base import Metric, of_truth, register
 from emt.shapes.ellipse import equivalent_ellipse
 from emt.shapes.overlap import ellipse_iou
 from emt.types import Estimate, Scalar, Truth
@@ -20,5 +20,12 @@ def iou(estimate: Estimate, truth: Truth) -> Scalar:
 
 
 register(
-    Metric("iou", "1", "higher", "intersection over union of the true and the estimated ellipse, mean over steps", iou)
+    Metric(
+        "iou",
+        "1",
+        "higher",
+        "intersection over union of the true and the estimated ellipse, mean over steps",
+        of_truth(iou),
+        smooth="soft_iou",
+    )
 )

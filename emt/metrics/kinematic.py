@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from emt.linalg import Mat2, Sym2, Vec2
-from emt.metrics.base import Metric, register
+from emt.metrics.base import Metric, of_truth, register
 from emt.shapes.ellipse import equivalent_ellipse, major_orientation
 from emt.types import Estimate, Scalar, Truth
 
@@ -55,7 +55,7 @@ register(
         "L",
         "lower",
         "root over runs of the mean squared position error at a step, mean over steps",
-        position_error_squared,
+        of_truth(position_error_squared),
         "rms",
         "rms",
     )
@@ -66,7 +66,7 @@ register(
         "L/s",
         "lower",
         "root over runs of the mean squared velocity error at a step, mean over steps",
-        velocity_error_squared,
+        of_truth(velocity_error_squared),
         "rms",
         "rms",
     )
@@ -77,7 +77,7 @@ register(
         "deg",
         "lower",
         "root of the mean over steps of the squared raw difference of orientations, mean over runs; not wrapped",
-        orientation_error_squared_deg,
+        of_truth(orientation_error_squared_deg),
         "rms",
     )
 )
@@ -87,7 +87,7 @@ register(
         "deg",
         "lower",
         "standard deviation over runs of orientation_rmse_deg",
-        orientation_error_squared_deg,
+        of_truth(orientation_error_squared_deg),
         "rms",
         "std",
     )
@@ -98,7 +98,7 @@ register(
         "deg",
         "lower",
         "as orientation_rmse_deg, with the angle between the major axes, wrapped to 90 degrees",
-        wrapped_orientation_error_squared_deg,
+        of_truth(wrapped_orientation_error_squared_deg),
         "rms",
     )
 )
@@ -108,6 +108,6 @@ register(
         "1",
         "neither",
         "normalised estimation error squared of position and velocity (4 if consistent), mean over steps",
-        nees,
+        of_truth(nees),
     )
 )

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from emt.linalg import Sym2
-from emt.metrics.base import Metric, register
+from emt.metrics.base import Metric, of_truth, register
 from emt.shapes.ellipse import equivalent_ellipse, extent_matrix
 from emt.types import Estimate, Scalar, Truth
 
@@ -47,15 +47,25 @@ def gaussian_wasserstein(estimate: Estimate, truth: Truth) -> Scalar:
     return jnp.sqrt(gaussian_wasserstein_squared(estimate, truth))
 
 
-register(Metric("gw_center_sq", "L²", "lower", "squared centre distance, mean over steps", center_distance_squared))
+register(
+    Metric("gw_center_sq", "L²", "lower", "squared centre distance, mean over steps", of_truth(center_distance_squared))
+)
 register(
     Metric(
         "gw_extent_sq",
         "L²",
         "lower",
         "extent term of the squared Gaussian-Wasserstein distance (semi-axes squared), mean over steps",
-        shape_distance_squared,
+        of_truth(shape_distance_squared),
     )
 )
-register(Metric("gw", "L", "lower", "Gaussian-Wasserstein distance, mean over steps of the root", gaussian_wasserstein))
-register(Metric("gw_std", "L", "lower", "standard deviation over runs of gw", gaussian_wasserstein, over_runs="std"))
+register(
+    Metric(
+        "gw", "L", "lower", "Gaussian-Wasserstein distance, mean over steps of the root", of_truth(gaussian_wasserstein)
+    )
+)
+register(
+    Metric(
+        "gw_std", "L", "lower", "standard deviation over runs of gw", of_truth(gaussian_wasserstein), over_runs="std"
+    )
+)

@@ -9,16 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emt.config.experiment import Experiment, PriorSettings
+from emt.config.experiment import Divergence, Experiment, PriorSettings
 from emt.filters.base import TrackingModel, guarded
 from emt.keys import Purpose, filter_key, purpose_key, run_key
 from emt.linalg import Sym2
-from emt.metrics.base import METRICS, Metric
+from emt.metrics.base import Metric, find_metric
 from emt.models.motion import FixedNoise, WhiteAcceleration
-from emt.montecarlo.run import Rules, Scores, Tracker, score
+from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
 from emt.registry import FILTERS, SCENARIOS
 from emt.shapes.moments import ellipse_of
-from emt.types import Ellipse, Measurements, Prior, Scenario, Traced, Truth
+from emt.types import Ellipse, Measurements, Prior, Scenario, Truth
 
 
 class Simulation(NamedTuple):
@@ -34,7 +34,7 @@ class WorldParams(NamedTuple):
     scenario: Any
     model: TrackingModel
     prior: Prior
-    position_limit: Traced
+    limits: Limits
 
 
 def cast(tree, dtype):
@@ -56,6 +56,13 @@ def prior_of(settings: PriorSettings) -> Prior:
         ellipse = ellipse_of(Sym2(*(jnp.asarray(n) for n in (n20, n11, n02))))
     mean, cov = jnp.asarray(settings.mean), jnp.asarray(settings.cov)
     return Prior(mean, cov, ellipse, settings.turn_rate, settings.turn_rate_variance)
+
+
+def limits_of(rule: Divergence | None) -> Limits:
+    """The divergence rule of a checked experiment; by default no run diverges."""
+    if rule is None:
+        return Limits(np.inf, None)
+    return Limits(np.inf if rule.position_error_above is None else rule.position_error_above, rule.final_iou_below)
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,7 @@ class Program:
                 model.extent_scale,
             ),
             prior_of(prior),
-            np.inf if experiment.divergence is None else experiment.divergence.position_error_above,
+            limits_of(experiment.divergence),
         )
         built = {label: FILTERS.get(settings.kind).builder(settings) for label, settings in experiment.filters.items()}
         world = cast(world, dtype)
@@ -103,7 +110,7 @@ class Program:
             {label: cast(params, dtype) for label, (params, _) in built.items()},
             make_scenario,
             {label: make for label, (_, make) in built.items()},
-            tuple(METRICS[name] for name in experiment.metrics),
+            tuple(find_metric(name) for name in experiment.metrics),
             n_steps,
         )
 
@@ -119,7 +126,7 @@ class Program:
         tracker = Tracker(flt, self.prior_of_run(world.prior, seed, run), self.experiment.start_with == "predict")
         key = filter_key(run_key(seed, run), label)
         dt = self.make_scenario(world.scenario).dt
-        return score(tracker, self.rules_for(label), target, scans, dt, key, world.position_limit)
+        return score(tracker, self.rules_for(label), target, scans, dt, key, world.limits)
 
     def prior_of_run(self, prior: Prior, seed, run) -> Prior:
         """What the filters are told in one run: the prior itself, or one with a mean drawn from it."""
@@ -135,6 +142,19 @@ class Program:
         """A reference filter is not compared with itself; it has no metrics."""
         metrics = () if label == self.experiment.reference else self.metrics
         return Rules(metrics, self.experiment.skip_steps, self.experiment.traces)
+
+    def without(self, metric: Metric) -> list[str]:
+        """Labels of the filters that do not have the metric, or are what the others are compared with."""
+
+        def estimate(label: str):
+            flt = self.make_filter[label](self.filter_params[label], self.world.model)
+            return flt.estimate(flt.init(self.world.prior, jax.random.key(0)))
+
+        return [
+            label
+            for label in self.filter_params
+            if label == self.experiment.reference or not metric.applies_to(jax.eval_shape(partial(estimate, label)))
+        ]
 
     def simulator(self) -> Callable[..., Simulation]:
         """Jitted (world, seed, runs) -> Simulation, mapped over runs."""

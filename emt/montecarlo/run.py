@@ -9,9 +9,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from emt.filters.base import keep_if
 from emt.keys import start_key, step_key
 from emt.metrics.base import Metric
+from emt.metrics.iou import iou
 from emt.shapes.ellipse import equivalent_ellipse
 from emt.status import FAILURE, Status
-from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, StarConvex, State, Truth
+from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, StarConvex, State, Traced, Truth
 
 
 class Track(NamedTuple):
@@ -37,7 +38,7 @@ class Scores(NamedTuple):
     """Scores of one filter in one run."""
 
     values: Float[Array, "n_metrics"]
-    """Each metric over the steps of the run."""
+    """Each metric over the steps of the run; 0 for a metric the filter does not have."""
     per_step: Float[Array, "n_steps n_metrics"]
     status: Int[Array, ""]
     """`Status` bits, or-ed over the steps."""
@@ -87,6 +88,15 @@ def as_truth(track: Track) -> Truth:
     return Truth(track.center, track.mean[:, 2:], Ellipse(track.semi_axes, track.orientation))
 
 
+class Limits(NamedTuple):
+    """When a run counts as diverged."""
+
+    position_error: Traced
+    """A larger error at any scan (m)."""
+    final_iou: Traced | None
+    """A smaller intersection over union at the last scan."""
+
+
 class Rules(NamedTuple):
     """How runs are scored."""
 
@@ -104,13 +114,13 @@ def score(
     scans: Measurements,
     dt: Float[Array, "n_steps"],
     key: PRNGKeyArray,
-    position_limit: Scalar,
+    limits: Limits,
 ) -> Scores:
     """Filters and scores one run.
 
     Args:
         truth: what estimates are compared with, with a leading time axis.
-        position_limit: a larger position error marks the run as diverged (m).
+        limits: what marks the run as diverged.
     """
 
     def step(carry, xs):
@@ -118,11 +128,14 @@ def score(
         k, scan, dt_k, now = xs
         state, info = advance(tracker, state, k, scan, dt_k, key)
         estimate = tracker.flt.estimate(state)
-        row = [metric.per_step(estimate, now) for metric in rules.metrics]
+        row = [
+            metric.per_step(estimate, now, info) if metric.applies_to(estimate) else jnp.zeros((), dt.dtype)
+            for metric in rules.metrics
+        ]
         row = jnp.stack(row) if row else jnp.zeros(0, dt.dtype)
         finite = jnp.isfinite(row).all()
         dx, dy = estimate.mean[0] - now.position[0], estimate.mean[1] - now.position[1]
-        diverged = dx * dx + dy * dy > position_limit * position_limit
+        diverged = dx * dx + dy * dy > limits.position_error * limits.position_error
         status = (
             info.status | jnp.where(finite, 0, int(Status.NON_FINITE)) | jnp.where(diverged, int(Status.DIVERGED), 0)
         )
@@ -133,7 +146,11 @@ def score(
     steps = jnp.arange(dt.shape[0])
     start = tracker.flt.init(tracker.prior, start_key(key))
     carry = (start, jnp.asarray(0), jnp.asarray(-1, steps.dtype))
-    (_, status, failed), (rows, track) = jax.lax.scan(step, carry, (steps, scans, dt, truth))
+    (state, status, failed), (rows, track) = jax.lax.scan(step, carry, (steps, scans, dt, truth))
+    if limits.final_iou is not None:
+        lost = iou(tracker.flt.estimate(state), jax.tree.map(lambda leaf: leaf[-1], truth)) < limits.final_iou
+        status = status | jnp.where(lost, int(Status.DIVERGED), 0)
+        failed = jnp.where((failed < 0) & lost, steps[-1], failed)
     means = rows[rules.first_step :].mean(axis=0)
     is_rms = jnp.array([metric.over_time == "rms" for metric in rules.metrics], bool)
     return Scores(jnp.where(is_rms, jnp.sqrt(means), means), rows, status, failed, track)

@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from emt.reports.ellipse_art import scene_of
-from emt.reports.plot_style import fixed_look, legend_below, new_figure, plain, png, styles_of
+from emt.reports.plot_style import MANEUVER, fixed_look, legend_below, new_figure, plain, png, styles_of
 from emt.reports.series_art import (
     chosen_metrics,
     draw_curves,
@@ -64,8 +65,9 @@ def over_time_figure(
     metrics: Sequence[Mapping[str, Any]],
     length_unit: str,
     dt_label: str = "scan",
-    max_panels: int = 4,
+    max_panels: int = 6,
     title: str = "",
+    maneuvers: Sequence[Sequence[float]] = (),
 ) -> bytes:
     """Metrics over time: mean over runs, its 95 % interval, and one standard deviation over runs.
 
@@ -78,6 +80,7 @@ def over_time_figure(
         dt_label: what a step is called.
         max_panels: at most so many metrics.
         title: heading, before the number of runs.
+        maneuvers: first and last scan number of each true manoeuvre, shaded.
 
     Returns:
         A PNG.
@@ -96,6 +99,8 @@ def over_time_figure(
                 styles,
                 length_unit,
             )
+            for first, last in maneuvers:
+                ax.axvspan(first, last, color=MANEUVER, lw=0.0, zorder=0)
         if not chosen:
             panels[0].set_axis_off()
             panels[0].text(0.5, 0.5, "no metrics", ha="center", va="center", color="#777777")
@@ -109,6 +114,9 @@ def over_time_figure(
             Line2D([], [], color=color, ls="none" if marker else dashes, marker=marker, lw=1.6)
             for color, dashes in (styles[label] for label in runs)
         ]
+        if maneuvers:
+            handles.append(Patch(color=MANEUVER))
+            names.append("true manoeuvre")
         legend_below(figure, handles, names)
         counted = _count_text(list(runs.values()))
         figure.suptitle(plain(f"{title} – {counted}" if title else counted))

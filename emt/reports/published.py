@@ -212,7 +212,7 @@ def summary_table(summary: dict[str, Any], length_unit: str) -> Table:
     rows, values = [], []
     for label in summary["labels"]:
         numbers, row = summary["filters"][label], {"filter": label}
-        for metric in metrics:
+        for metric in (m for m in metrics if m["name"] in numbers):
             ours = numbers[metric["name"]]
             value, error = value_and_error(ours["value"], ours["se"])
             row[metric["name"]] = f"{value} ± {error}" if error else value

@@ -23,7 +23,9 @@ def steps_table(arrays: Arrays, labels: list[str], metrics: list[dict[str, Any]]
             row |= dict(zip(("x", "y", "vx", "vy"), map(float, track["mean"][k]), strict=True))
             row |= {"semi_axis_1": float(track["semi_axes"][k, 0]), "semi_axis_2": float(track["semi_axes"][k, 1])}
             row |= {"orientation": float(track["orientation"][k]), "nis": float(track["nis"][k])}
-            for column, metric in enumerate(metrics[: track["per_step"].shape[1]]):
+            for column, metric in enumerate(metrics):
+                if label in metric["without"]:
+                    continue
                 name = metric["name"] + (" (squared)" if metric["over_time"] == "rms" else "")
                 row[name] = float(track["per_step"][k, column])
             rows.append(row | {"status": int(track["status"][k])})
@@ -42,7 +44,7 @@ def overview_table(
     for label in labels:
         values = arrays[f"{label}/values"][0]
         row = {"filter": label, "flags": ", ".join(Status.names_of(int(arrays[f"{label}/status"][0]))) or "none"}
-        row |= {m["name"]: significant(float(values[column]), 5) for column, m in shown if column < len(values)}
+        row |= {m["name"]: significant(float(values[column]), 5) for column, m in shown if label not in m["without"]}
         failed = int(arrays[f"{label}/failed_step"][0])
         rows.append(row | {"failed": str(failed + 1) if failed >= 0 else ""})
     return Table(title, columns, rows, rows)

@@ -176,12 +176,11 @@ def run_series(
         }
         for label in labels
     }
-    # a filter that the others are compared with has no metrics of its own
-    scored = [label for label in labels if track[label]["per_step"].shape[-1] == len(metrics)]
     panels: list[Series] = []
-    if scored:
-        column = {metric["name"]: k for k, metric in enumerate(metrics)}
-        for metric in chosen_metrics(metrics, most):
+    column = {metric["name"]: k for k, metric in enumerate(metrics)}
+    for metric in chosen_metrics(metrics, most):
+        scored = [label for label in labels if label not in metric["without"]]
+        if scored:
             values = {label: track[label]["per_step"][:, column[metric["name"]]] for label in scored}
             if metric["over_time"] == "rms":
                 values = {label: np.sqrt(np.maximum(v, 0.0)) for label, v in values.items()}

@@ -131,6 +131,7 @@ def summarise(reader: RunReader) -> dict[str, Any]:
         filters[label] = {
             metric["name"]: summarise_metric(metric, results, column, first_step)
             for column, metric in enumerate(metrics)
+            if label not in metric["without"]
         }
         names = Counter(name for bits in results.status for name in Status.names_of(int(bits)))
         failed = ~results.sound
@@ -159,5 +160,5 @@ def curves(reader: RunReader, label: str) -> dict[str, Curve]:
     n = int(results.step_count.sum())
     mean = results.step_sum.sum(axis=0) / max(n, 1)
     variance = np.maximum(results.step_squares / max(n, 1) - mean**2, 0.0)
-    names = [metric["name"] for metric in reader.manifest["metrics"]]
-    return {name: Curve(mean[:, k], np.sqrt(variance[:, k]), n) for k, name in enumerate(names)}
+    columns = {m["name"]: k for k, m in enumerate(reader.manifest["metrics"]) if label not in m["without"]}
+    return {name: Curve(mean[:, k], np.sqrt(variance[:, k]), n) for name, k in columns.items()}

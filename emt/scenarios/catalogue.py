@@ -1,5 +1,5 @@
 """Imports every scenario of this package, which registers it under its kind."""
 
-from emt.scenarios import constant_velocity, coordinated_turns, course, recorded, stationary, trajectory
+from emt.scenarios import annotated, constant_velocity, coordinated_turns, course, recorded, stationary, trajectory
 
-__all__ = ["constant_velocity", "coordinated_turns", "course", "recorded", "stationary", "trajectory"]
+__all__ = ["annotated", "constant_velocity", "coordinated_turns", "course", "recorded", "stationary", "trajectory"]

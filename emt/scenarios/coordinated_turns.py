@@ -1,18 +1,14 @@
 """An ellipse that moves at constant speed on straights and circular arcs."""
 
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
 from pydantic import PositiveInt, model_validator
 
 from emt.registry import SCENARIOS
-from emt.scenarios.detections import DetectionParams, DetectionSettings, capacity_for, params_of, sample_scans
+from emt.scenarios.detections import DetectionSettings
+from emt.scenarios.given_track import given_track
 from emt.settings import Angle, Duration, Length, PositiveLength, Quantity, Settings, Speed, TurnRate
-from emt.types import Ellipse, Scenario, Traced, Truth
 
 Instant = Annotated[float, Quantity("s", ge=0)]
 
@@ -50,6 +46,12 @@ class CoordinatedTurnsSettings(Settings):
     def n_steps(self) -> int:
         return self.steps
 
+    @property
+    def maneuvers(self) -> tuple[tuple[float, float], ...]:
+        """Begin and end of each turn, in scan numbers from 1."""
+        ends = [(turn.start, turn.start + turn.duration) for turn in self.turns]
+        return tuple(tuple(1.0 + (t - self.first_scan) / self.dt for t in pair) for pair in ends)  # type: ignore[misc]
+
     @model_validator(mode="after")
     def _turns_in_order(self):
         for k, (one, other) in enumerate(zip(self.turns[:-1], self.turns[1:], strict=True)):
@@ -58,19 +60,6 @@ class CoordinatedTurnsSettings(Settings):
                     f"turns: turn {k + 1} starts at {other.start:g} s, before the end of the one before it"
                 )
         return self
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Params:
-    """Traced numbers of the scenario."""
-
-    dt: Traced
-    position: Float[Array, "n_steps 2"]
-    velocity: Float[Array, "n_steps 2"]
-    orientation: Float[Array, "n_steps"]
-    semi_axes: Float[Array, "2"]
-    detections: DetectionParams
 
 
 def trajectory(settings: CoordinatedTurnsSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,28 +95,7 @@ def build(settings: CoordinatedTurnsSettings, runs: int):
     position, velocity, angle = trajectory(settings)
     vx, vy = settings.velocity
     first = float(np.arctan2(vy, vx)) if settings.orientation == "heading" else settings.orientation
-    params = Params(
-        settings.dt,
-        jnp.asarray(position),
-        jnp.asarray(velocity),
-        jnp.asarray(first + angle),
-        jnp.asarray(settings.semi_axes),
-        params_of(settings.detections),
-    )
-    detections, n_steps = settings.detections, settings.steps
-    capacity = capacity_for(detections, n_steps, runs)
-
-    def make(params: Params) -> Scenario:
-        def scans(truth: Truth, key):
-            return sample_scans(key, truth, detections, params.detections, capacity)
-
-        def sample_truth(key) -> Truth:
-            axes = jnp.broadcast_to(params.semi_axes, (n_steps, 2))
-            return Truth(params.position, params.velocity, Ellipse(axes, params.orientation))
-
-        return Scenario(jnp.full(n_steps, params.dt), sample_truth, scans)
-
-    return params, make
+    return given_track(settings.detections, runs, settings.dt, position, velocity, first + angle, settings.semi_axes)
 
 
 SCENARIOS.register("coordinated_turns", CoordinatedTurnsSettings, build)

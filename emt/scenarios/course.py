@@ -1,19 +1,15 @@
 """A vehicle that drives a course given by its speed and turn rate over time, seen as points in its bounding box."""
 
 import itertools
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
 from pydantic import Field, PositiveInt, field_validator
 
 from emt.registry import SCENARIOS
-from emt.scenarios.detections import DetectionParams, DetectionSettings, capacity_for, params_of, sample_scans
+from emt.scenarios.detections import DetectionSettings
+from emt.scenarios.given_track import given_track
 from emt.settings import Angle, Duration, Length, PositiveLength, Quantity, Settings, Speed, TurnRate
-from emt.types import Ellipse, Scenario, Traced, Truth
 
 Instant = Annotated[float, Quantity("s", ge=0)]
 
@@ -41,6 +37,18 @@ class CourseSettings(Settings):
     def n_steps(self) -> int:
         return self.steps
 
+    @property
+    def maneuvers(self) -> tuple[tuple[float, float], ...]:
+        """Begin and end of each stretch with a turn rate, in scan numbers from 1."""
+        found: list[tuple[float, float]] = []
+        for (begin, before), (end, after) in itertools.pairwise(self.turn_rate):
+            if before != 0.0 or after != 0.0:
+                first, last = 1.0 + begin / self.dt, 1.0 + end / self.dt
+                if found and found[-1][1] == first:
+                    first = found.pop()[0]
+                found.append((first, last))
+        return tuple(found)
+
     @field_validator("speed", "turn_rate")
     @classmethod
     def _in_order(cls, nodes):
@@ -48,19 +56,6 @@ class CourseSettings(Settings):
             if later <= earlier:
                 raise ValueError(f"times must increase, but {later:g} s follows {earlier:g} s")
         return nodes
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class Params:
-    """Traced numbers of the scenario."""
-
-    dt: Traced
-    position: Float[Array, "n_steps 2"]
-    velocity: Float[Array, "n_steps 2"]
-    heading: Float[Array, "n_steps"]
-    semi_axes: Float[Array, "2"]
-    detections: DetectionParams
 
 
 def trajectory(settings: CourseSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -81,28 +76,8 @@ def trajectory(settings: CourseSettings) -> tuple[np.ndarray, np.ndarray, np.nda
 def build(settings: CourseSettings, runs: int):
     """Traced parameters and static builder of the settings."""
     position, velocity, heading = trajectory(settings)
-    params = Params(
-        settings.dt,
-        jnp.asarray(position),
-        jnp.asarray(velocity),
-        jnp.asarray(heading),
-        jnp.asarray(np.array(settings.box) / np.sqrt(2.0)),  # the smallest enclosing ellipse, by area
-        params_of(settings.detections),
-    )
-    detections, n_steps = settings.detections, settings.steps
-    capacity = capacity_for(detections, n_steps, runs)
-
-    def make(params: Params) -> Scenario:
-        def scans(truth: Truth, key):
-            return sample_scans(key, truth, detections, params.detections, capacity)
-
-        def sample_truth(key) -> Truth:
-            axes = jnp.broadcast_to(params.semi_axes, (n_steps, 2))
-            return Truth(params.position, params.velocity, Ellipse(axes, params.heading))
-
-        return Scenario(jnp.full(n_steps, params.dt), sample_truth, scans)
-
-    return params, make
+    axes = np.array(settings.box) / np.sqrt(2.0)  # the smallest enclosing ellipse, by area
+    return given_track(settings.detections, runs, settings.dt, position, velocity, heading, axes)
 
 
 SCENARIOS.register("course", CourseSettings, build)

@@ -1,6 +1,5 @@
 """Recorded scans, read from a file of the user's."""
 
-import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,9 @@ from jaxtyping import Array, Bool, Float
 from pydantic import Field
 
 from emt.registry import SCENARIOS
+from emt.scenarios.data import DataError, read_data
 from emt.settings import Duration, Settings
 from emt.types import Ellipse, Measurements, Scenario, Traced, Truth
-
-MAX_BYTES = 1 << 30
-"""Largest file that is read."""
 
 
 class RecordedSettings(Settings):
@@ -39,10 +36,6 @@ class RecordedSettings(Settings):
     has_truth: ClassVar[bool] = False
 
 
-class DataError(ValueError):
-    """A recording that cannot be used; the message is for the user."""
-
-
 @register_dataclass
 @dataclass(frozen=True)
 class Params:
@@ -59,18 +52,7 @@ def read_scans(settings: RecordedSettings) -> list[np.ndarray]:
     Raises:
         DataError: the file is missing, too large, damaged, of another hash or of another layout.
     """
-    if settings.path is None:
-        raise DataError("is required: give the recording's file, e.g. scenario.path=FILE")
-    path = Path(settings.path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError(f"'{path}' is larger than {MAX_BYTES >> 20} MiB")
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"cannot read '{path}': {error.strerror or error}") from error
-    found = hashlib.sha256(content).hexdigest()
-    if settings.sha256 is not None and found != settings.sha256:
-        raise DataError(f"'{path}' is not the expected recording: sha256 is {found}, expected {settings.sha256}")
+    path, content = read_data(settings.path, settings.sha256)
     match path.suffix.lower():
         case ".mat":
             return _scans_from_mat(path, content, settings.variable)

@@ -1,17 +1,14 @@
 """An object at rest: for single updates and for convergence with the number of scans."""
 
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import jax.numpy as jnp
-from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
+import numpy as np
 from pydantic import PositiveInt
 
 from emt.registry import SCENARIOS
-from emt.scenarios.detections import DetectionParams, DetectionSettings, capacity_for, params_of, sample_scans
+from emt.scenarios.detections import DetectionSettings
+from emt.scenarios.given_track import given_track
 from emt.settings import Angle, Duration, Length, PositiveLength, Settings
-from emt.types import Ellipse, Scenario, Traced, Truth
 
 
 class StationarySettings(Settings):
@@ -32,42 +29,11 @@ class StationarySettings(Settings):
         return self.steps
 
 
-@register_dataclass
-@dataclass(frozen=True)
-class Params:
-    """Traced numbers of the scenario."""
-
-    dt: Traced
-    position: Float[Array, "2"]
-    orientation: Traced
-    semi_axes: Float[Array, "2"]
-    detections: DetectionParams
-
-
 def build(settings: StationarySettings, runs: int):
     """Traced parameters and static builder of the settings."""
-    params = Params(
-        settings.dt,
-        jnp.asarray(settings.position),
-        settings.orientation,
-        jnp.asarray(settings.semi_axes),
-        params_of(settings.detections),
-    )
-    detections, n_steps = settings.detections, settings.steps
-    capacity = capacity_for(detections, n_steps, runs)
-
-    def make(params: Params) -> Scenario:
-        def scans(truth: Truth, key):
-            return sample_scans(key, truth, detections, params.detections, capacity)
-
-        def sample_truth(key) -> Truth:
-            position = jnp.broadcast_to(params.position, (n_steps, 2))
-            axes = jnp.broadcast_to(params.semi_axes, (n_steps, 2))
-            return Truth(position, jnp.zeros_like(position), Ellipse(axes, jnp.full(n_steps, params.orientation)))
-
-        return Scenario(jnp.full(n_steps, params.dt), sample_truth, scans)
-
-    return params, make
+    position = np.tile(settings.position, (settings.steps, 1))
+    track = position, np.zeros_like(position), settings.orientation, settings.semi_axes
+    return given_track(settings.detections, runs, settings.dt, *track)
 
 
 SCENARIOS.register("stationary", StationarySettings, build)

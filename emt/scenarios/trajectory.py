@@ -1,18 +1,15 @@
 """A fixed trajectory of straight legs and turns, flown by a rigid ellipse that points along its heading."""
 
-from dataclasses import dataclass
+import itertools
 from typing import ClassVar, Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
 from pydantic import PositiveInt
 
 from emt.registry import SCENARIOS
-from emt.scenarios.detections import DetectionParams, DetectionSettings, capacity_for, params_of, sample_scans
+from emt.scenarios.detections import DetectionSettings
+from emt.scenarios.given_track import given_track
 from emt.settings import Angle, Duration, Length, PositiveLength, Settings, Speed
-from emt.types import Ellipse, Scenario, Traced, Truth
 
 
 class Leg(Settings):
@@ -44,18 +41,15 @@ class TrajectorySettings(Settings):
     def n_steps(self) -> int:
         return sum(leg.steps for leg in self.legs)
 
-
-@register_dataclass
-@dataclass(frozen=True)
-class Params:
-    """Traced numbers of the scenario."""
-
-    dt: Traced
-    start: Float[Array, "2"]
-    heading: Float[Array, "n_steps"]
-    speed: Float[Array, "n_steps"]
-    semi_axes: Float[Array, "2"]
-    detections: DetectionParams
+    @property
+    def maneuvers(self) -> tuple[tuple[float, float], ...]:
+        """First and last scan number, from 1, of each leg that turns."""
+        ends = itertools.accumulate(leg.steps for leg in self.legs)
+        return tuple(
+            (end - leg.steps + 1, end)
+            for leg, end in zip(self.legs, ends, strict=True)
+            if isinstance(leg.heading, tuple)
+        )
 
 
 def headings_and_speeds(settings: TrajectorySettings) -> tuple[np.ndarray, np.ndarray]:
@@ -71,33 +65,11 @@ def headings_and_speeds(settings: TrajectorySettings) -> tuple[np.ndarray, np.nd
 def build(settings: TrajectorySettings, runs: int):
     """Traced parameters and static builder of the settings."""
     heading, speed = headings_and_speeds(settings)
-    params = Params(
-        settings.dt,
-        jnp.asarray(settings.start),
-        jnp.asarray(heading),
-        jnp.asarray(speed),
-        jnp.asarray(settings.semi_axes),
-        params_of(settings.detections),
-    )
-    detections, n_steps = settings.detections, settings.n_steps
-    capacity = capacity_for(detections, n_steps, runs)
-
-    def make(params: Params) -> Scenario:
-        def scans(truth: Truth, key):
-            return sample_scans(key, truth, detections, params.detections, capacity)
-
-        def sample_truth(key) -> Truth:
-            velocity = params.speed[:, None] * jnp.stack([jnp.cos(params.heading), jnp.sin(params.heading)], axis=1)
-            moves = (params.dt * velocity).at[0].set(0.0)
-            return Truth(
-                params.start[None, :] + jnp.cumsum(moves, axis=0),
-                velocity,
-                Ellipse(jnp.broadcast_to(params.semi_axes, (n_steps, 2)), params.heading),
-            )
-
-        return Scenario(jnp.full(n_steps, params.dt), sample_truth, scans)
-
-    return params, make
+    velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    moves = settings.dt * velocity
+    moves[0] = 0.0
+    position = np.asarray(settings.start) + np.cumsum(moves, axis=0)
+    return given_track(settings.detections, runs, settings.dt, position, velocity, heading, settings.semi_axes)
 
 
 SCENARIOS.register("trajectory", TrajectorySettings, build)

@@ -9,7 +9,7 @@ from emt.filters.base import TrackingModel, as_scan
 from emt.filters.imm import ImmSettings
 from emt.filters.lan_li import LanLiSettings
 from emt.filters.moment_ukf import MomentUkfSettings
-from emt.filters.moment_update import Projection, augmented_update, expected, point_update
+from emt.filters.moment_update import Projection, augmented_update, expected, point_update, projected
 from emt.filters.unscented import Gaussian, Spread, square_root
 from emt.linalg import Sym2, Vec2
 from emt.models.motion import WhiteAcceleration
@@ -145,7 +145,7 @@ def test_projection_keeps_a_wide_prior_sound():
         z = Vec2(jnp.asarray(point[0]), jnp.asarray(point[1]))
         now = expected(belief, z, Sym2.of(NOISE), spread, bounds)
         assert now.variance > (now.cross**2).sum() + 1.0 / 12.0 - 1e-12
-        belief = point_update(belief, z, Sym2.of(NOISE), spread, bounds)
+        belief, _ = projected(point_update(belief, z, Sym2.of(NOISE), spread, bounds), bounds)
         n11, n20, n02 = belief.mean[:3]
         values = np.linalg.eigvalsh(np.array([[n20, n11], [n11, n02]]))
         assert values[1] >= 0.1 * (1 - 1e-9)

@@ -26,7 +26,7 @@ from emt.metrics.wasserstein import (
     shape_distance_squared,
 )
 from emt.shapes.ellipse import equivalent_ellipse
-from emt.types import Ellipse, Estimate, StarConvex, Truth
+from emt.types import Ellipse, Estimate, Info, StarConvex, Truth
 from tests.filters.cases import FAST_COMPILE
 from tests.reference import gaussian_wasserstein as reference
 
@@ -204,6 +204,7 @@ def test_catalogue_is_complete_and_described():
         assert metric.name == name
         assert metric.definition
         assert metric.unit
-        value = metric.per_step(estimate_of((0.5, 0.0, 3.0, 1.0, 0.3)), truth_of((0.0, 0.0, 3.0, 1.0, 0.3)))
+        truth = truth_of((0.0, 0.0, 3.0, 1.0, 0.3))
+        value = metric.per_step(estimate_of((0.5, 0.0, 3.0, 1.0, 0.3)), truth, Info(*map(jnp.asarray, (-3.0, 2.0, 0))))
         assert value.shape == ()
         assert np.isfinite(float(value))

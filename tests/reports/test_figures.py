@@ -22,11 +22,11 @@ from emt.reports.summary import Curve
 from emt.status import Status
 
 METRICS = [
-    {"name": "nees", "unit": "1", "over_time": "mean", "over_runs": "mean", "definition": ""},
-    {"name": "position_rmse", "unit": "L", "over_time": "rms", "over_runs": "rms", "definition": ""},
-    {"name": "gw", "unit": "L", "over_time": "mean", "over_runs": "mean", "definition": ""},
-    {"name": "gw_std", "unit": "L", "over_time": "mean", "over_runs": "std", "definition": ""},
-    {"name": "iou", "unit": "1", "over_time": "mean", "over_runs": "mean", "definition": ""},
+    {"name": "nees", "unit": "1", "over_time": "mean", "over_runs": "mean", "definition": "", "without": []},
+    {"name": "position_rmse", "unit": "L", "over_time": "rms", "over_runs": "rms", "definition": "", "without": []},
+    {"name": "gw", "unit": "L", "over_time": "mean", "over_runs": "mean", "definition": "", "without": []},
+    {"name": "gw_std", "unit": "L", "over_time": "mean", "over_runs": "std", "definition": "", "without": []},
+    {"name": "iou", "unit": "1", "over_time": "mean", "over_runs": "mean", "definition": "", "without": []},
 ]
 RIVALS = ["vb", "mem_ekf_star", "feldmann", "gp_ett", "a", "b", "c", "d"]
 
@@ -168,7 +168,8 @@ def test_no_metrics_show_the_shape_instead():
 def test_a_reference_filter_has_no_scores():
     arrays = make_arrays()
     arrays["vb/track/per_step"] = np.zeros((2, 60, 0))
-    assert list(run_series(arrays, ["vb", "mem_ekf_star"], METRICS, 0, "m", 4)[0].values) == ["mem_ekf_star"]
+    others = [metric | {"without": ["vb"]} for metric in METRICS]
+    assert list(run_series(arrays, ["vb", "mem_ekf_star"], others, 0, "m", 4)[0].values) == ["mem_ekf_star"]
 
 
 def test_telling_metrics_come_first():

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from emt.scenarios import recorded
-from emt.scenarios.recorded import DataError, RecordedSettings, read_scans
+from emt.scenarios import data
+from emt.scenarios.data import DataError
+from emt.scenarios.recorded import RecordedSettings, read_scans
 from tests.filters.cases import cast
 
 SCANS = [np.array([[450.0, 240.0], [460.0, 250.5]]), np.zeros((0, 2)), np.array([[1.0, 2.0]])]
@@ -136,7 +137,7 @@ def test_unknown_format(tmp_path):
 
 
 def test_too_large(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, "MAX_BYTES", 100)
+    monkeypatch.setattr(data, "MAX_BYTES", 100)
     assert "is larger than" in refusal(write_mat(tmp_path, Z=cells(SCANS)))
 
 

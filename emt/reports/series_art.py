@@ -22,6 +22,7 @@ READABLE = {
     "velocity_rmse": "RMS velocity error",
     "orientation_rmse_deg": "RMS orientation error, not wrapped",
     "orientation_rmse_wrapped_deg": "RMS orientation error",
+    "moments_projected": "fraction of scans with a projection",
     "nees": "NEES of position and velocity",
 }
 Z95 = 1.96
@@ -37,6 +38,8 @@ def chosen_metrics(metrics: Sequence[Mapping[str, Any]], most: int) -> list[Mapp
 def readable(metric: Mapping[str, Any]) -> str:
     """Name of a metric in words, or as registered."""
     name = str(metric["name"])
+    if name.startswith("mode_") and name.endswith("_probability"):
+        return f"probability of mode {name.removeprefix('mode_').removesuffix('_probability')}"
     return READABLE.get(name, name)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from emt.scenarios import data
+from emt.scenarios import data, recorded
 from emt.scenarios.data import DataError
 from emt.scenarios.recorded import RecordedSettings, read_scans
 from tests.filters.cases import cast

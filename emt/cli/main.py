@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from emt.cli import bench, checking, describing, running
+from emt.cli import bench, checking, describing, running, tuning
 from emt.cli.errors import run_app
 
 app = typer.Typer(
@@ -44,6 +44,7 @@ app.command("run")(running.run)
 app.command("reproduce")(running.reproduce)
 app.command("table")(running.table)
 app.command("replay")(running.replay)
+app.command("tune")(tuning.tune)
 app.command("verify")(checking.verify)
 app.command("check")(checking.check)
 app.command("bench")(bench.bench)

@@ -151,6 +151,7 @@ class Document(NamedTuple):
         line: Line where the value starts.
         flow: Whether it is a collection in brackets or braces.
         end: Position in the text just after the value.
+        spans: Begin and end in the text of each value; uses of one alias or merge share theirs.
     """
 
     value: Any
@@ -158,6 +159,7 @@ class Document(NamedTuple):
     line: int
     flow: bool
     end: int
+    spans: dict[KeyPath, tuple[int, int]]
 
 
 def parse_document(text: str, file: str) -> Document | None:
@@ -180,6 +182,7 @@ class _Node:
     merged: list[tuple[int, "_Node"]] = field(default_factory=list)
     is_open: bool = True  # still being read: an alias to it would contain itself
     flat: dict[str, tuple[int, "_Node"]] | None = None  # pairs with merges resolved
+    span: tuple[int, int] = (0, 0)
 
 
 class _Parser:
@@ -190,6 +193,7 @@ class _Parser:
         self.problems: list[Problem] = []
         self.anchors: dict[str, _Node] = {}
         self.lines: dict[KeyPath, int] = {}
+        self.spans: dict[KeyPath, tuple[int, int]] = {}
         self.spent = 0
         self.events: Iterator[Any] = iter(())
 
@@ -211,7 +215,7 @@ class _Parser:
         self.spent = 0
         self.lines[()] = line
         value = self.expand(root, (), 0, line)
-        document = Document(value, self.lines, line, bool(getattr(first, "flow_style", False)), end)
+        document = Document(value, self.lines, line, bool(getattr(first, "flow_style", False)), end, self.spans)
         if self.problems:
             raise ConfigError(self.problems, document)
         return document
@@ -256,6 +260,7 @@ class _Parser:
             node = _Node("mapping" if isinstance(event, MappingStartEvent) else "list")
         if event.anchor is not None:
             self.anchors[event.anchor] = node
+        begin = event.start_mark.index
         if isinstance(event, MappingStartEvent):
             event = self.read_pairs(node, path, depth)
         elif isinstance(event, SequenceStartEvent):
@@ -264,6 +269,7 @@ class _Parser:
                 line = event.start_mark.line + 1
                 node.entries.append((line, self.read(event, entry_path, depth + 1)[0]))
         node.is_open = False
+        node.span = begin, event.end_mark.index
         return node, event.end_mark.index
 
     def aliased(self, event: Any, path: KeyPath, line: int) -> _Node:
@@ -350,6 +356,7 @@ class _Parser:
         for key, (child_line, child) in pairs:
             child_path = (*path, key)
             self.lines[child_path] = child_line
+            self.spans[child_path] = child.span
             self.spend(child_line, key)
             result[key] = self.expand(child, child_path, depth + 1, child_line)
         return list(result.values()) if is_list else result

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emt.config.experiment import Divergence, Experiment, PriorSettings
+from emt.config.experiment import Divergence, Experiment, ModelSettings, PriorSettings
 from emt.filters.base import TrackingModel, guarded
 from emt.keys import Purpose, filter_key, purpose_key, run_key
 from emt.linalg import Sym2
@@ -58,6 +58,16 @@ def prior_of(settings: PriorSettings) -> Prior:
     return Prior(mean, cov, ellipse, settings.turn_rate, settings.turn_rate_variance)
 
 
+def model_of(settings: ModelSettings) -> TrackingModel:
+    """The world model of a checked experiment."""
+    noise = settings.process_noise
+    return TrackingModel(
+        WhiteAcceleration(noise.psd) if noise.kind == "white_acceleration" else FixedNoise.of(noise.cov),
+        Sym2.of(np.array(settings.noise_cov)),
+        settings.extent_scale,
+    )
+
+
 def limits_of(rule: Divergence | None) -> Limits:
     """The divergence rule of a checked experiment; by default no run diverges."""
     if rule is None:
@@ -89,18 +99,8 @@ class Program:
         scenario_params, make_scenario = SCENARIOS.get(experiment.scenario.kind).builder(
             experiment.scenario, experiment.monte_carlo.runs
         )
-        model, prior = experiment.model, experiment.model.prior
-        noise = model.process_noise
-        world = WorldParams(
-            scenario_params,
-            TrackingModel(
-                WhiteAcceleration(noise.psd) if noise.kind == "white_acceleration" else FixedNoise.of(noise.cov),
-                Sym2.of(np.array(model.noise_cov)),
-                model.extent_scale,
-            ),
-            prior_of(prior),
-            limits_of(experiment.divergence),
-        )
+        model = experiment.model
+        world = WorldParams(scenario_params, model_of(model), prior_of(model.prior), limits_of(experiment.divergence))
         built = {label: FILTERS.get(settings.kind).builder(settings) for label, settings in experiment.filters.items()}
         world = cast(world, dtype)
         n_steps = jax.eval_shape(lambda p: make_scenario(p).dt, world.scenario).shape[0]

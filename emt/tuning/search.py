@@ -1,0 +1,178 @@
+"""A search over parameters: candidates on tuning runs, the answer on runs that had no part in it."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from emt.config.errors import COMMAND_LINE, ConfigError, Problem
+from emt.config.load import Loaded
+from emt.metrics.base import Metric, find_metric
+from emt.registry import UnknownName
+from emt.tuning.gradient import Descent, Point
+from emt.tuning.parameters import Parameter, candidate, combinations, rounded
+from emt.tuning.scoring import Batch, Score
+from emt.tuning.trial import build_trial
+
+FIRST_TUNING_RUN = 1_000_000_000
+"""Tuning runs are numbered from here, beyond those of any experiment."""
+
+Method = Literal["grid", "gradient"]
+OnProgress = Callable[[str], None]
+
+
+class Tried(NamedTuple):
+    """One candidate of a search."""
+
+    values: tuple[Any, ...]
+    objective: float
+    error: float
+    failed: int
+    """Runs that failed on it."""
+
+
+class Comparison(NamedTuple):
+    """One metric of the start and of the answer on the same runs."""
+
+    metric: Metric
+    runs: Literal["tuning", "reporting"]
+    start: Score
+    tuned: Score
+
+
+class Outcome(NamedTuple):
+    """What a search found."""
+
+    label: str
+    parameters: tuple[Parameter, ...]
+    values: tuple[Any, ...]
+    """The answer."""
+    tried: tuple[Tried, ...]
+    comparisons: tuple[Comparison, ...]
+    seconds: float
+    """Of the search, compilation included; without the scores on reporting runs."""
+    tuning_runs: int
+    reporting_runs: int
+
+
+class Plan(NamedTuple):
+    """How a search is made."""
+
+    method: Method
+    objective: Metric
+    followed: Metric
+    """The smooth metric a gradient follows; the objective itself on a grid."""
+    tuning_runs: int
+    reporting_runs: int
+    steps: int
+    rate: float
+
+
+def plan_of(loaded: Loaded, method: Method, objective: str | None, **numbers: Any) -> Plan:
+    """A plan, with the first metric of the experiment that has a better and a worse as the default objective.
+
+    Raises:
+        ConfigError: the objective is unknown, cannot be tuned for, or needs a truth that is not there.
+    """
+    try:
+        named = [find_metric(name) for name in ([objective] if objective else loaded.experiment.metrics)]
+    except UnknownName as error:
+        raise refused(str(error)) from None
+    usable = [metric for metric in named if metric.better != "neither" and metric.over_runs != "std"]
+    if not usable:
+        text = f"'{objective}' has no better or worse value of a single run" if objective else "no metric to tune for"
+        raise refused(f"{text}; choose for instance gw, iou, position_rmse or nll")
+    chosen = usable[0]
+    has_truth = loaded.experiment.scenario.has_truth
+    if not has_truth and loaded.experiment.reference == "truth" and chosen.name != "nll":
+        raise refused("a recording without truth can only be tuned for nll, or against a reference filter")
+    followed = find_metric(chosen.smooth) if method == "gradient" and chosen.smooth else chosen
+    if not has_truth:
+        numbers |= {"tuning_runs": 1, "reporting_runs": 1}
+    return Plan(method, chosen, followed, **numbers)
+
+
+def refused(message: str) -> ConfigError:
+    """A problem with the objective."""
+    return ConfigError([Problem(COMMAND_LINE, None, "--objective", message)])
+
+
+def search(
+    loaded: Loaded, label: str, parameters: Sequence[Parameter], plan: Plan, on_progress: OnProgress = lambda text: None
+) -> Outcome:
+    """Searches and compares the answer with the start.
+
+    An answer may not fail in more runs than the start does.
+
+    Raises:
+        ConfigError: a candidate is not valid, or the objective does not exist for this filter.
+    """
+    began = time.perf_counter()
+    first = FIRST_TUNING_RUN if loaded.experiment.scenario.has_truth else 0
+    wanted = tuple(dict.fromkeys((plan.followed, plan.objective)))
+    batch = Batch(loaded, label, wanted, first, plan.tuning_runs)
+    for metric in wanted:
+        if label in batch.program.without(metric):
+            raise refused(f"filter '{label}' does not have the metric '{metric.name}'")
+    start = tuple(p.start for p in parameters)
+    path = descend if plan.method == "gradient" else sweep
+    tried = path(loaded, parameters, batch, plan, on_progress)
+    sound = [one for one in tried if math.isfinite(one.objective) and one.failed <= tried[0].failed]
+    sign = -1.0 if plan.followed.better == "higher" else 1.0
+    answer = min(sound, key=lambda one: sign * one.objective).values if sound else start
+    # rounded before the last comparison, so that what is written is what was scored
+    values = tuple(rounded(value) for value in answer) if answer != start else start
+    seconds = time.perf_counter() - began
+    both = [candidate(loaded, parameters, one) for one in (start, values)]
+    trials = [build_trial(one.experiment, label) for one in both]
+    comparisons = compared(batch, trials, "tuning")
+    on_progress(f"scoring the answer on {plan.reporting_runs} other runs")
+    shown = [m for m in map(find_metric, loaded.experiment.metrics) if m.over_runs != "std"]
+    shown = [m for m in dict.fromkeys((*wanted, *shown)) if label not in batch.program.without(m)]
+    comparisons += compared(Batch(loaded, label, shown, 0, plan.reporting_runs), trials, "reporting")
+    return Outcome(
+        label,
+        tuple(parameters),
+        values,
+        tuple(tried),
+        tuple(comparisons),
+        seconds,
+        plan.tuning_runs,
+        plan.reporting_runs,
+    )
+
+
+def compared(batch: Batch, trials: list[Any], runs: Literal["tuning", "reporting"]) -> list[Comparison]:
+    """Every metric of a batch for start and answer."""
+    start, tuned = batch.score(trials)
+    return [Comparison(m, runs, a, b) for m, a, b in zip(batch.metrics, start, tuned, strict=True)]
+
+
+def sweep(loaded: Loaded, parameters: Sequence[Parameter], batch: Batch, plan: Plan, tell: OnProgress) -> list[Tried]:
+    """The start and every point of the grid."""
+    points = [tuple(p.start for p in parameters), *combinations(parameters)]
+    trials = [build_trial(candidate(loaded, parameters, values).experiment, batch.label) for values in points]
+    tell(f"compiling; {len(points)} candidates on {plan.tuning_runs} runs each")
+    scores = batch.score(trials, lambda done: tell(f"{done}/{len(points)} candidates"))
+    column = batch.metrics.index(plan.objective)
+    rows = [score[column] for score in scores]
+    return [Tried(values, one.value, one.error, one.failed) for values, one in zip(points, rows, strict=True)]
+
+
+def descend(loaded: Loaded, parameters: Sequence[Parameter], batch: Batch, plan: Plan, tell: OnProgress) -> list[Tried]:
+    """The path of the gradient; its values are of the followed metric."""
+
+    def told(step: int, point: Point) -> None:
+        tell(f"step {step}/{plan.steps}: {plan.followed.name} {point.value:.6g}")
+
+    tell(f"compiling; at most {plan.steps} steps on {plan.tuning_runs} runs")
+    path = Descent(batch, loaded, parameters).run(plan.steps, plan.rate, told)
+    return [
+        Tried(
+            tuple(p.start if k == 0 else p.value(float(t)) for p, t in zip(parameters, point.theta, strict=True)),
+            point.value,
+            math.nan,
+            point.failed,
+        )
+        for k, point in enumerate(path)
+    ]

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -68,10 +67,13 @@ class Descent:
             return self.value(jax.tree.unflatten(structure, full))
 
         floats = [leaf for leaf, real in zip(leaves, is_float, strict=True) if real]
-        along = partial(jax.jvp, of_floats, (floats,), has_aux=True)
-        one = lambda move: along((move,))[1]  # noqa: E731
-        gradient = jax.vmap(one)([move for move, real in zip(moves, is_float, strict=True) if real])
-        return *of_floats(floats), gradient
+
+        def along(move):
+            return jax.jvp(of_floats, (floats,), (move,), has_aux=True)
+
+        moves = [move for move, real in zip(moves, is_float, strict=True) if real]
+        value, gradient, failed = jax.vmap(along, out_axes=(None, 0, None))(moves)
+        return value, failed, gradient
 
     def at(self, theta: np.ndarray) -> Point:
         """Value and gradient at these coordinates."""

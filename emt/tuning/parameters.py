@@ -155,9 +155,7 @@ def rounded(value: Any) -> Any:
 def _parameters_at(key: str, data: Any) -> Iterator[Parameter]:
     pattern = parse_key(key)
     if pattern[0] not in TUNABLE:
-        raise ValueError(
-            f"only settings under {' and '.join(TUNABLE)} can be tuned: others change the data or the runs"
-        )
+        raise ValueError(f"only settings under {' and '.join(TUNABLE)} can be tuned; others change the data")
     tied: dict[tuple[Any, ...], list[KeyPath]] = {}
     for path in _matches(data, pattern, ()):
         for leaf in _leaves(_at(data, path), path):
@@ -175,13 +173,13 @@ def _parameters_at(key: str, data: Any) -> Iterator[Parameter]:
         yield Parameter(name, tuple(paths), start, unit, None, None)
 
 
-def _at(data: Any, path: KeyPath) -> Any:
+def _at(data: Any, path: tuple[Any, ...]) -> Any:
     for part in path:
         data = data[part]
     return data
 
 
-def _matches(data: Any, pattern: KeyPath, path: KeyPath) -> Iterator[KeyPath]:
+def _matches(data: Any, pattern: tuple[Any, ...], path: tuple[Any, ...]) -> Iterator[KeyPath]:
     """Paths in the data that fit a pattern with `*`."""
     if not pattern:
         yield path
@@ -189,9 +187,7 @@ def _matches(data: Any, pattern: KeyPath, path: KeyPath) -> Iterator[KeyPath]:
     part, rest = pattern[0], pattern[1:]
     if isinstance(data, list) and isinstance(part, str) and part.isdecimal():
         part = int(part)
-    names: list[Any] = (
-        list(data) if isinstance(data, dict) else list(range(len(data))) if isinstance(data, list) else []
-    )
+    names: list[Any] = list(data if isinstance(data, dict) else range(len(data)) if isinstance(data, list) else ())
     found = names if part == "*" else [part] if part in names else []
     if not found:
         near = suggest(str(part), map(str, names))
@@ -199,10 +195,10 @@ def _matches(data: Any, pattern: KeyPath, path: KeyPath) -> Iterator[KeyPath]:
         known = f"; given there: {', '.join(map(str, names))}" if names else ""
         raise ValueError(f"'{dotted(path) or 'the file'}' gives no '{part}'{hint}{known}")
     for name in found:
-        yield from _matches(data[name], rest, (*path, name))
+        yield from _matches(_at(data, (name,)), rest, (*path, name))
 
 
-def _leaves(value: Any, path: KeyPath) -> Iterator[KeyPath]:
+def _leaves(value: Any, path: tuple[Any, ...]) -> Iterator[KeyPath]:
     """Every number below a value; the value itself, whatever it is, if nothing is below it."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
     if items is None:
@@ -223,9 +219,7 @@ def _with_range(parameter: Parameter, wanted: str | None, grid: bool) -> Paramet
         if not grid:
             return parameter._replace(start=float(start))
         if start <= 0:
-            raise ValueError(
-                f"is {start:g}: give LOW:HIGH or values, there is no grid about a number that is not positive"
-            )
+            raise ValueError(f"is {start:g}, not positive: give LOW:HIGH or values")
         return parameter._replace(values=tuple(rounded(float(start) * factor) for factor in DEFAULT_FACTORS))
     if ":" not in wanted:
         if not grid:

@@ -51,7 +51,7 @@ def scores_table(outcome: Outcome, length_unit: str) -> Table:
     for one in outcome.comparisons:
         gap, error = one.tuned.above(one.start)
         cells = {
-            name: "{} ± {}".format(*value_and_error(a, b)) if math.isfinite(b) else significant(a, 5)
+            name: "{} ± {}".format(*value_and_error(a, b)) if b > 0.0 else significant(a, 5)
             for name, (a, b) in {
                 "start": (one.start.value, one.start.error),
                 "tuned": (one.tuned.value, one.tuned.error),

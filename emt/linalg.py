@@ -284,3 +284,18 @@ def all_finite(tree) -> Real:
     """Whether every number of a pytree is finite."""
     leaves = [jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.stack(leaves).all()
+
+
+def cholesky(matrix):
+    """Lower Cholesky factor of a small positive definite matrix (n, n); NaN if it is not.
+
+    Column by column in plain operations, which batch and have derivatives without a triangular solver: that of XLA can
+    wait for itself for ever on a CPU (seen with jaxlib 0.10 in batches of 600).
+    """
+    rest, columns = matrix, []
+    below = jnp.arange(matrix.shape[0])
+    for j in range(matrix.shape[0]):
+        column = jnp.where(below >= j, rest[:, j] / jnp.sqrt(rest[j, j]), 0.0)
+        columns.append(column)
+        rest = rest - column[:, None] * column[None, :]
+    return jnp.stack(columns, axis=1)

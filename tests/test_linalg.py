@@ -13,6 +13,7 @@ from emt.linalg import (
     Sym2,
     Vec2,
     all_finite,
+    cholesky,
     fuse,
     is_positive_definite,
     parallel,
@@ -240,3 +241,14 @@ def test_all_finite_looks_at_every_inexact_leaf():
     assert bool(all_finite({"a": jnp.ones(2), "b": jnp.asarray(3)}))
     assert not bool(all_finite({"a": jnp.ones(2), "b": jnp.array([1.0, jnp.inf])}))
     assert not bool(all_finite((jnp.asarray(jnp.nan), jnp.ones(2))))
+
+
+def test_cholesky_of_small_matrices():
+    rng = np.random.default_rng(4)
+    for n in (1, 2, 5, 8):
+        factor = rng.normal(size=(6, n, n))
+        cov = factor @ np.swapaxes(factor, -1, -2) + 0.1 * np.eye(n)
+        np.testing.assert_allclose(
+            jax.vmap(cholesky)(jnp.asarray(cov)), np.linalg.cholesky(cov), rtol=1e-12, atol=1e-13
+        )
+    assert not np.isfinite(cholesky(jnp.array([[1.0, 2.0], [2.0, 1.0]]))).all()

@@ -117,12 +117,19 @@ def _with_entry(text: str, document: Document, key: str) -> str:
         begin, end = document.spans[path]
         return text[:begin] + f"{'' if text[begin - 1 : begin].isspace() else ' '}[{key}]" + text[end:]
     if document.value.get("sources"):
-        first = next(p for p in document.spans if p[:1] == ("sources",) and len(p) == 2)
-        at = text.rfind(str(first[1]), 0, document.spans[first][0])
-        line, _ = _line_of(text, at)
-        in_flow = text[line:at].strip() != ""
-        return text[:at] + f"calibrated: [{key}]" + (", " if in_flow else newline + text[line:at]) + text[at:]
-    if "sources" in document.value:
+        begin, _ = document.spans[("sources",)]
+        if text[begin] == "{":
+            return text[: begin + 1] + f"calibrated: [{key}], " + text[begin + 1 :]
+        number = min(line for p, line in document.lines.items() if p[:1] == ("sources",) and len(p) == 2) - 1
+        lines = text.splitlines(keepends=True)
+        indent = lines[number][: len(lines[number]) - len(lines[number].lstrip())]
+        lines.insert(number, f"{indent}calibrated: [{key}]{newline}")
+        return "".join(lines)
+    if document.value.get("sources") == {}:
         begin, end = document.spans[("sources",)]
-        return text[:begin] + f"{newline}  calibrated: [{key}]" + text[end:]
+        return text[:begin] + f"{{calibrated: [{key}]}}" + text[end:]
+    if "sources" in document.value:
+        lines = text.splitlines(keepends=True)
+        lines.insert(document.lines[("sources",)], f"  calibrated: [{key}]{newline}")
+        return "".join(lines)
     return text.rstrip() + f"{newline}{newline}sources:{newline}  calibrated: [{key}]{newline}"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 
+from emt.linalg import cholesky
 from emt.types import Scalar, Traced
 
 
@@ -53,7 +54,7 @@ def square_root(cov: Float[Array, "n n"], jitter: float | None = None) -> Float[
         jitter = 1e-10 if cov.dtype == jnp.float64 else 1e-5
     # a component that is known exactly keeps a row of zeros
     correlation = cov / (scale[:, None] * scale[None, :]) + jnp.diag(jnp.where(sound, jitter, 1.0))
-    return jnp.where(sound, scale, 0.0)[:, None] * jnp.linalg.cholesky(correlation)
+    return jnp.where(sound, scale, 0.0)[:, None] * cholesky(correlation)
 
 
 def scalar_update(belief: Gaussian, cross: Float[Array, "n"], residual: Scalar, variance: Scalar) -> Gaussian:

@@ -12,7 +12,7 @@ import numpy as np
 from emt.config.experiment import Divergence, Experiment, ModelSettings, PriorSettings
 from emt.filters.base import TrackingModel, guarded
 from emt.keys import Purpose, filter_key, purpose_key, run_key
-from emt.linalg import Sym2
+from emt.linalg import Sym2, cholesky
 from emt.metrics.base import Metric, find_metric
 from emt.models.motion import FixedNoise, WhiteAcceleration
 from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
@@ -134,7 +134,7 @@ class Program:
             return prior
         draw = jax.random.normal(purpose_key(run_key(seed, run), Purpose.PRIOR), (5,), prior.mean.dtype)
         return prior._replace(
-            mean=prior.mean + jnp.linalg.cholesky(prior.cov) @ draw[:4],
+            mean=prior.mean + cholesky(prior.cov) @ draw[:4],
             turn_rate=prior.turn_rate + jnp.sqrt(prior.turn_rate_var) * draw[4],
         )
 

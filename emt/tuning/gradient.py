@@ -54,7 +54,8 @@ class Descent:
     def value(self, trial: Trial) -> tuple[jax.Array, jax.Array]:
         """The metric over the sound runs, and how many failed."""
         shares, sound = self.batch.shares(self.built.make, trial)
-        return shares[0].sum() / jnp.maximum(sound.sum(), 1), (~sound).sum()
+        used = jnp.maximum(sound.sum(dtype=shares.dtype), 1.0)
+        return shares[0].sum() / used, (~sound).sum()
 
     def _slopes(self, trial: Trial, tangents: Trial):
         leaves, structure = jax.tree.flatten(trial)

@@ -192,7 +192,7 @@ def _matches(data: Any, pattern: tuple[Any, ...], path: tuple[Any, ...]) -> Iter
     if not found:
         near = suggest(str(part), map(str, names))
         hint = f" (did you mean '{near}'?)" if near else ""
-        known = f"; given there: {', '.join(map(str, names))}" if names else ""
+        known = f"; given there: {', '.join(map(str, names))} (--set KEY=VALUE gives more)" if names else ""
         raise ValueError(f"'{dotted(path) or 'the file'}' gives no '{part}'{hint}{known}")
     for name in found:
         yield from _matches(_at(data, (name,)), rest, (*path, name))

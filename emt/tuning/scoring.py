@@ -1,6 +1,7 @@
 """Scores of candidates on a fixed batch of runs: common random numbers, so differences between them are sharp."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -60,7 +61,7 @@ def shares_of(metric: Metric, rows: jax.Array, sound: jax.Array) -> jax.Array:
     share mean_k (√m_k + (e²_k - m_k) / 2√m_k), with m_k the mean square at step k: shares average to the value exactly
     and spread as the value does.
     """
-    used = jnp.maximum(sound.sum(), 1)
+    used = jnp.maximum(sound.sum(dtype=rows.dtype), 1.0)
     rows = jnp.where(sound[:, None], rows, 0.0)
     if metric.over_runs == "rms":
         root = jnp.sqrt(rows.sum(axis=0) / used)
@@ -123,7 +124,7 @@ class Batch:
             parts = [group[k : k + together] for k in range(0, len(group), together)]
             finished = [one(parts[0])]  # the first one compiles
             with ThreadPoolExecutor(WORKERS) as pool:
-                for members, (shares, sound) in (*finished, *pool.map(one, parts[1:])):
+                for members, (shares, sound) in itertools.chain(finished, pool.map(one, parts[1:])):
                     for k, member in enumerate(members):
                         results[member] = scores_of(np.asarray(shares[k]), np.asarray(sound[k]))
                     done += len(members)

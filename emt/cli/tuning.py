@@ -71,19 +71,22 @@ def tune(
 
     outcome = search(loaded, chosen, found, plan, tell)
     for table in (
-        tried_table(outcome, plan.followed.name, plan.followed.better == "lower"),
+        tried_table(outcome, plan),
         parameters_table(outcome),
         scores_table(outcome, loaded.experiment.length_unit),
     ):
         typer.echo(table.render("text"))
     notes = [f"{len(outcome.tried)} candidates in {outcome.seconds:.0f} s, compilation included."]
     if plan.followed is not plan.objective:
-        notes.append(f"The gradient followed {plan.followed.name}, a smooth stand-in for {plan.objective.name}.")
+        notes.append(
+            f"The gradient followed {plan.followed.name}, a smooth stand-in; some points of its path were scored by "
+            f"{plan.objective.name}, and the best of them is the answer."
+        )
     if not loaded.experiment.scenario.has_truth:
         notes.append("A recording is one run: both scores are of the data that was tuned on.")
     typer.echo(" ".join(notes))
     if csv is not None:
-        csv.write_text(tried_table(outcome, plan.followed.name, True).render("csv"), encoding="utf-8")
+        csv.write_text(tried_table(outcome, plan).render("csv"), encoding="utf-8")
         say(f"candidates: {csv}")
     if write and outcome.values == tuple(p.start for p in found):
         say(f"{config}: nothing better was found, the file stays as it is")

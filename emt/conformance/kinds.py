@@ -18,16 +18,15 @@ from emt.conformance.golden import (
     scan_of,
     time_step,
 )
+from emt.conformance.shape_kinds import compare_ellipse_iou, compare_gaussian_wasserstein, compare_moment_update
 from emt.filters import feldmann, gp_ett
 from emt.filters import mem_ekf_star as mem
 from emt.filters import vb_random_matrix as vb
 from emt.filters.base import TrackingModel, scan_statistics
 from emt.filters.kinematics import Kinematics
 from emt.linalg import Chol3, Sym2, Vec2
-from emt.metrics.wasserstein import extent_distance_squared
 from emt.models.motion import FixedNoise, WhiteAcceleration
 from emt.scenarios.recorded import RecordedSettings, read_scans
-from emt.shapes.overlap import ellipse_intersection_area, ellipse_iou
 from emt.types import Scalar
 
 NO_NOISE = FixedNoise.of(np.zeros((4, 4)))
@@ -282,53 +281,13 @@ def compare_gp_ett(content: dict) -> Iterator[Quantity]:
             yield Quantity("covariance", jnp.diagonal(state.cov), step["P_upd_diag"])
 
 
-# --- metrics ----------------------------------------------------------------------------------------------------
-
-
-def _ellipses(content: dict):
-    e1, e2 = array([p["e1"] for p in content["pairs"]]), array([p["e2"] for p in content["pairs"]])
-    return e1, e2
-
-
-def compare_ellipse_iou(content: dict) -> Iterator[Quantity]:
-    """Intersection over union of pairs of ellipses; tolerances by kind of pair as the file states them."""
-    e1, e2 = _ellipses(content)
-
-    def both(a, b):
-        arguments = (a[:2], a[2:4], a[4], b[:2], b[2:4], b[4])
-        return ellipse_iou(*arguments), ellipse_intersection_area(*arguments)
-
-    iou, area = jax.jit(jax.vmap(both))(e1, e2)
-    stated = content["tolerance"]["float64"]
-    limits = {kind: limit for kinds, limit in stated.items() for kind in kinds.split(",")}
-    for k, pair in enumerate(content["pairs"]):
-        limit = limits.get(pair["kind"], stated["all other kinds"])
-        yield Quantity("intersection over union", iou[k], pair["iou"], scale=1.0, tolerance=limit)
-        smaller = min(np.prod(pair["e1"][2:4]), np.prod(pair["e2"][2:4])) * np.pi
-        yield Quantity("intersection area", area[k], pair["intersection"], scale=float(smaller), tolerance=limit)
-
-
-def compare_gaussian_wasserstein(content: dict) -> Iterator[Quantity]:
-    """Squared distances, relative to |Δc|² + tr X1 + tr X2."""
-    e1, e2 = _ellipses(content)
-
-    def squared(a, b):
-        d = a[:2] - b[:2]
-        return d @ d + extent_distance_squared(Sym2.ellipse(a[2], a[3], a[4]), Sym2.ellipse(b[2], b[3], b[4]))
-
-    got = jax.jit(jax.vmap(squared))(e1, e2)
-    for k, pair in enumerate(content["pairs"]):
-        a, b = np.asarray(pair["e1"]), np.asarray(pair["e2"])
-        scale = float(((a[:2] - b[:2]) ** 2).sum() + (a[2:4] ** 2).sum() + (b[2:4] ** 2).sum())
-        yield Quantity("squared distance", got[k], pair["gw_squared"], scale=scale)
-
-
 KINDS = {
     "vb_update": Kind(compare_vb, DEFAULT_TOLERANCE),
     "real_data_vb": Kind(compare_real_data_vb, 1e-7, needs_data=True),
     "mem_ekf_star": Kind(compare_mem_ekf_star, DEFAULT_TOLERANCE),
     "feldmann_rm": Kind(compare_feldmann, DEFAULT_TOLERANCE),
     "gp_ett": Kind(compare_gp_ett, 1e-6),
+    "moment_update": Kind(compare_moment_update, 1e-12),
     "ellipse_iou": Kind(compare_ellipse_iou, 1e-6),
     "gaussian_wasserstein": Kind(compare_gaussian_wasserstein, DEFAULT_TOLERANCE),
 }

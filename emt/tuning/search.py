@@ -17,6 +17,9 @@ from emt.tuning.trial import build_trial
 FIRST_TUNING_RUN = 1_000_000_000
 """Tuning runs are numbered from here, beyond those of any experiment."""
 
+SCORED_POINTS = 10
+"""Points of a path, about, that are scored by the objective where the gradient follows another metric."""
+
 Method = Literal["grid", "gradient"]
 OnProgress = Callable[[str], None]
 
@@ -26,9 +29,12 @@ class Tried(NamedTuple):
 
     values: tuple[Any, ...]
     objective: float
+    """On the tuning runs; NaN where only the followed metric was computed."""
     error: float
     failed: int
     """Runs that failed on it."""
+    followed: float
+    """The metric a gradient follows; the objective itself on a grid."""
 
 
 class Comparison(NamedTuple):
@@ -118,7 +124,7 @@ def search(
     path = descend if plan.method == "gradient" else sweep
     tried = path(loaded, parameters, batch, plan, on_progress)
     sound = [one for one in tried if math.isfinite(one.objective) and one.failed <= tried[0].failed]
-    sign = -1.0 if plan.followed.better == "higher" else 1.0
+    sign = -1.0 if plan.objective.better == "higher" else 1.0
     answer = min(sound, key=lambda one: sign * one.objective).values if sound else start
     # rounded before the last comparison, so that what is written is what was scored
     values = tuple(rounded(value) for value in answer) if answer != start else start
@@ -156,23 +162,47 @@ def sweep(loaded: Loaded, parameters: Sequence[Parameter], batch: Batch, plan: P
     scores = batch.score(trials, lambda done: tell(f"{done}/{len(points)} candidates"))
     column = batch.metrics.index(plan.objective)
     rows = [score[column] for score in scores]
-    return [Tried(values, one.value, one.error, one.failed) for values, one in zip(points, rows, strict=True)]
+    return [
+        Tried(values, one.value, one.error, one.failed, one.value) for values, one in zip(points, rows, strict=True)
+    ]
 
 
 def descend(loaded: Loaded, parameters: Sequence[Parameter], batch: Batch, plan: Plan, tell: OnProgress) -> list[Tried]:
-    """The path of the gradient; its values are of the followed metric."""
+    """The path of the gradient. Where it follows a stand-in, some of its points are scored by the objective itself:
+    what is better for the one need not be for the other."""
 
     def told(step: int, point: Point) -> None:
         tell(f"step {step}/{plan.steps}: {plan.followed.name} {point.value:.6g}")
 
     tell(f"compiling; at most {plan.steps} steps on {plan.tuning_runs} runs")
     path = Descent(batch, loaded, parameters).run(plan.steps, plan.rate, told)
+    values = [tuple(p.value(float(t)) for p, t in zip(parameters, point.theta, strict=True)) for point in path]
+    values[0] = tuple(p.start for p in parameters)
+    if plan.followed is plan.objective:
+        return [
+            Tried(v, point.value, math.nan, point.failed, point.value) for v, point in zip(values, path, strict=True)
+        ]
+    chosen = scored_steps(path, plan)
+    tell(f"scoring {len(chosen)} of its points by {plan.objective.name}")
+    trials = [build_trial(candidate(loaded, parameters, values[k]).experiment, batch.label) for k in chosen]
+    column = batch.metrics.index(plan.objective)
+    scores = {k: score[column] for k, score in zip(chosen, batch.score(trials), strict=True)}
     return [
         Tried(
-            tuple(p.start if k == 0 else p.value(float(t)) for p, t in zip(parameters, point.theta, strict=True)),
-            point.value,
-            math.nan,
+            values[k],
+            scores[k].value if k in scores else math.nan,
+            scores[k].error if k in scores else math.nan,
             point.failed,
+            point.value,
         )
         for k, point in enumerate(path)
     ]
+
+
+def scored_steps(path: Sequence[Point], plan: Plan) -> list[int]:
+    """Points of a path that are scored by the objective: some spread evenly over it, and the one that is best for the
+    followed metric."""
+    sign = -1.0 if plan.followed.better == "higher" else 1.0
+    finite = [k for k, point in enumerate(path) if math.isfinite(point.value)]
+    best = min(finite, key=lambda k: sign * path[k].value, default=0)
+    return sorted({0, best, *finite[:: max(len(finite) // SCORED_POINTS, 1)]})

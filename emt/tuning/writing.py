@@ -12,7 +12,7 @@ from emt.config.source import parse_source
 from emt.reports.numbers import significant, unit_text, value_and_error
 from emt.reports.table import Column, Table
 from emt.tuning.parameters import Parameter, candidate
-from emt.tuning.search import Outcome
+from emt.tuning.search import Outcome, Plan
 
 MOST_ROWS = 10
 
@@ -66,28 +66,30 @@ def scores_table(outcome: Outcome, length_unit: str) -> Table:
     return Table("scores", columns, rows, values)
 
 
-def tried_table(outcome: Outcome, followed: str, best_is_low: bool) -> Table:
-    """Candidates by their value on the tuning runs, the best first; every one of them for machines."""
-    names = [p.name for p in outcome.parameters]
-    columns = [*(Column(name, name, True) for name in names), Column("value", followed, True)]
-    columns.append(Column("failed", "failed", True))
-    sign = 1.0 if best_is_low else -1.0
+def tried_table(outcome: Outcome, plan: Plan) -> Table:
+    """Candidates by their value on the tuning runs, the best first; every one of them, in order, for machines."""
+    names, objective, followed = [p.name for p in outcome.parameters], plan.objective.name, plan.followed.name
+    columns = [*(Column(name, name, True) for name in names), Column("value", objective, True)]
+    columns += [Column("followed", followed, True)] * (followed != objective) + [Column("failed", "failed", True)]
+    sign = 1.0 if plan.objective.better == "lower" else -1.0
     order = sorted(outcome.tried, key=lambda one: sign * one.objective if math.isfinite(one.objective) else math.inf)
     rows = [
         dict(zip(names, map(shown, one.values), strict=True))
         | {
-            "value": f"{significant(one.objective, 5)}"
+            "value": significant(one.objective, 5)
             + (f" ± {significant(one.error, 2)}" if math.isfinite(one.error) else ""),
+            "followed": significant(one.followed, 5),
             "failed": str(one.failed),
         }
         for one in order[:MOST_ROWS]
+        if math.isfinite(one.objective)
     ]
     values = [
-        dict(zip(names, one.values, strict=True)) | {followed: one.objective, "se": one.error, "failed": one.failed}
+        dict(zip(names, one.values, strict=True))
+        | {objective: one.objective, "se": one.error, followed: one.followed, "failed": one.failed}
         for one in outcome.tried
     ]
-    title = f"best of {len(outcome.tried)} candidates on the tuning runs"
-    return Table(title, columns, rows, values)
+    return Table(f"best of {len(outcome.tried)} candidates on the tuning runs", columns, rows, values)
 
 
 def prepare_text(loaded: Loaded, parameters: Sequence[Parameter], values: Sequence[Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from emt.registry import SCENARIOS, suggest
+from emt.registry import SCENARIOS
 from emt.scenarios.data import DataError, read_data
 from emt.scenarios.detections import DetectionSettings
 from emt.scenarios.given_track import given_track
@@ -72,7 +72,7 @@ def read_boxes(settings: AnnotatedSettings) -> np.ndarray:
 def _boxes_of(path: Path, table, settings: AnnotatedSettings) -> np.ndarray:
     tracks = sorted({int(track) for track in table["track"]})
     if settings.track not in tracks:
-        near = suggest(str(settings.track), map(str, tracks)) or min(tracks, key=lambda t: abs(t - settings.track))
+        near = min(tracks, key=lambda t: abs(t - settings.track))
         raise DataError(f"'{path}' has no track {settings.track} (nearest: {near}; it has {len(tracks)})", "track")
     rows = table[(table["track"] == settings.track) & (table["lost"] == 0)].sort_values("frame")
     frames = rows["frame"].to_numpy(np.int64)

@@ -57,7 +57,7 @@ class CoordinatedTurnsSettings(Settings):
         for k, (one, other) in enumerate(zip(self.turns[:-1], self.turns[1:], strict=True)):
             if other.start < one.start + one.duration:
                 raise ValueError(
-                    f"turns: turn {k + 1} starts at {other.start:g} s, before the end of the one before it"
+                    f"turns: turn {k + 2} starts at {other.start:g} s, before the end of the one before it"
                 )
         return self
 

@@ -30,7 +30,7 @@ def project(moments: Sym2, floor: Scalar, ratio: Scalar) -> Sym2:
     round_ = squared <= 0.0
     radius = jnp.where(round_, 0.0, jnp.sqrt(jnp.where(round_, 1.0, squared)))  # differentiable for circles too
     larger, smaller = jnp.maximum(mean + radius, floor), mean - radius
-    smaller = jnp.maximum(smaller, ratio * larger)
+    smaller = jnp.where(round_, larger, jnp.maximum(smaller, ratio * larger))  # a circle has no axis to be thin along
     acts = (larger != mean + radius) | (smaller != mean - radius)
     shrink = 0.5 * (larger - smaller) / jnp.where(round_, 1.0, radius)
     centre = 0.5 * (larger + smaller)

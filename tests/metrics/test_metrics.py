@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import emt.metrics.catalogue  # noqa: F401 - fills the catalogue
-from emt.metrics.base import METRICS
+from emt.metrics.base import METRICS, find_metric
 from emt.metrics.iou import iou
 from emt.metrics.kinematic import (
     nees,
@@ -25,6 +25,7 @@ from emt.metrics.wasserstein import (
     gaussian_wasserstein_squared,
     shape_distance_squared,
 )
+from emt.registry import UnknownName
 from emt.shapes.ellipse import equivalent_ellipse
 from emt.types import Ellipse, Estimate, Info, StarConvex, Truth
 from tests.filters.cases import FAST_COMPILE
@@ -208,3 +209,44 @@ def test_catalogue_is_complete_and_described():
         value = metric.per_step(estimate_of((0.5, 0.0, 3.0, 1.0, 0.3)), truth, Info(*map(jnp.asarray, (-3.0, 2.0, 0))))
         assert value.shape == ()
         assert np.isfinite(float(value))
+
+
+def of_each(metric, e1, e2):
+    info = Info(jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0))
+    return float(jax.jit(metric.per_step)(estimate_of(e1), truth_of(e2), info))
+
+
+@given(ELLIPSE, ELLIPSE)
+def test_the_soft_overlap_is_a_share_like_the_overlap(e1, e2):
+    soft = METRICS["soft_iou"]
+    value = of_each(soft, e1, e2)
+    assert 0.0 <= value <= 1.0 + 1e-12
+    assert value == pytest.approx(of_each(soft, e2, e1), rel=1e-9, abs=1e-300)
+    assert of_each(soft, e1, e1) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_the_soft_overlap_is_the_integral_of_bumps():
+    """2s / (1 + s²) for similar ellipses of area ratio s; for parted ones by summation over a grid."""
+    for s in (0.3, 1.0, 2.5):
+        value = of_each(METRICS["soft_iou"], (0, 0, 4 * s**0.5, 2 * s**0.5, 0.4), (0, 0, 4, 2, 0.4))
+        assert value == pytest.approx(2 * s / (1 + s * s), rel=1e-12)
+    x, y = np.meshgrid(np.linspace(-12, 12, 481), np.linspace(-12, 12, 481))
+
+    def bump(cx, cy, a, b, angle):
+        u, v = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle), (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
+        return np.exp(-2.0 * (u * u / a**2 + v * v / b**2))
+
+    e1, e2 = (0.5, -0.2, 3.0, 1.0, 0.3), (-0.4, 0.6, 2.0, 1.5, 1.2)
+    f, g = bump(*e1), bump(*e2)
+    expected = (f * g).sum() / ((f * f).sum() + (g * g).sum() - (f * g).sum())
+    assert of_each(METRICS["soft_iou"], e1, e2) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_metric_of_a_mode_belongs_to_filters_with_that_mode():
+    metric = find_metric("mode_ct_probability")
+    estimate = estimate_of((0.0, 0.0, 1.0, 1.0, 0.0))
+    assert not metric.applies_to(estimate)
+    assert metric.applies_to(estimate._replace(modes={"ct": jnp.asarray(0.25)}))
+    assert not metric.applies_to(estimate._replace(modes={"cv": jnp.asarray(0.25)}))
+    with pytest.raises(UnknownName, match="mode_NAME_probability"):
+        find_metric("mode_probability")

@@ -65,3 +65,9 @@ def test_points_fill_the_box_and_lie_in_the_true_ellipse():
 def test_times_out_of_order_are_refused():
     with pytest.raises(ValidationError, match="times must increase, but 3 s follows 5 s"):
         CourseSettings.model_validate({**SETTINGS, "speed": [[5.0, 1.0], [3.0, 1.0]]})
+
+
+def test_maneuvers_are_where_the_rate_is_not_zero():
+    assert CourseSettings.model_validate(SETTINGS).maneuvers == ((11.0, 21.0),)
+    straight = CourseSettings.model_validate({**SETTINGS, "turn_rate": [[0.0, 0.0], [5.0, 0.0]]})
+    assert straight.maneuvers == ()

@@ -24,8 +24,8 @@ ROWS = (
 )
 
 
-def settings(path, **changes):
-    given = {"kind": "annotated", "path": str(path), "track": 3, "dt": 0.5, "detections": DETECTIONS} | changes
+def settings(file, **changes):
+    given = {"kind": "annotated", "path": str(file), "track": 3, "dt": 0.5, "detections": DETECTIONS} | changes
     return AnnotatedSettings.model_validate(given)
 
 

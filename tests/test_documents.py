@@ -77,7 +77,8 @@ def test_every_number_that_does_not_agree_has_a_sentence(report):
     title = ""
     for line in report.read_text(encoding="utf-8").splitlines():
         if line.startswith("**"):
-            title = re.match(r"\*\*(Table \w+)", line)[1] if line.startswith("**Table") else ""
+            named = re.match(r"\*\*(Table \w+|Section [\w-]+(?:, tuned)?)", line)
+            title = named[1] if named else ""
         cells = [cell.strip() for cell in line.split("|")]
         verdicts = {"close", "differs", "not comparable"}
         if title and len(cells) > 9 and cells[8] in verdicts:

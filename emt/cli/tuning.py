@@ -46,7 +46,7 @@ def tune(
     from emt.config.load import load_experiment
     from emt.config.shipped import config_names
     from emt.tuning.parameters import label_of, parse_parameters
-    from emt.tuning.search import plan_of, search
+    from emt.tuning.search import holds_elsewhere, plan_of, search
     from emt.tuning.writing import parameters_table, prepare_text, scores_table, tried_table, write_answer
 
     loaded = load_experiment(config, overrides or [])
@@ -84,12 +84,15 @@ def tune(
         )
     if not loaded.experiment.scenario.has_truth:
         notes.append("A recording is one run: both scores are of the data that was tuned on.")
+    changed, holds = outcome.values != tuple(p.start for p in found), holds_elsewhere(outcome, plan)
+    if changed and not holds:
+        notes.append("The answer is no better on the reporting runs: keep the start.")
     typer.echo(" ".join(notes))
     if csv is not None:
         csv.write_text(tried_table(outcome, plan).render("csv"), encoding="utf-8")
         say(f"candidates: {csv}")
-    if write and outcome.values == tuple(p.start for p in found):
-        say(f"{config}: nothing better was found, the file stays as it is")
-    elif write:
+    if write and changed and holds:
         write_answer(loaded, outcome)
         say(f"written: {config}")
+    elif write:
+        say(f"{config}: nothing better was found, the file stays as it is")

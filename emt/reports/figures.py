@@ -87,7 +87,8 @@ def over_time_figure(
     """
     with fixed_look():
         styles = styles_of(list(curves))
-        chosen = [m for m in chosen_metrics(metrics, max_panels) if any(m["name"] in c for c in curves.values())]
+        told = [m for m in metrics if any(m["name"] in c and c[m["name"]].mean.any() for c in curves.values())]
+        chosen = chosen_metrics(told, max_panels)  # nothing but zeros needs no panel
         rows, columns = grid(max(len(chosen), 1))
         figure = new_figure(7.2 if columns == 1 else 9.6, 0.9 + (2.1 if columns == 1 else 2.5) * rows)
         panels: list[Axes] = list(figure.subplots(rows, columns, squeeze=False).ravel())

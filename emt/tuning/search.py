@@ -61,6 +61,13 @@ class Outcome(NamedTuple):
     reporting_runs: int
 
 
+def holds_elsewhere(outcome: Outcome, plan: "Plan") -> bool:
+    """Whether the answer is better than the start on the reporting runs too."""
+    one = next(c for c in outcome.comparisons if c.runs == "reporting" and c.metric.name == plan.objective.name)
+    gap, _ = one.tuned.above(one.start)
+    return gap < 0.0 if plan.objective.better == "lower" else gap > 0.0
+
+
 class Plan(NamedTuple):
     """How a search is made."""
 

@@ -95,5 +95,5 @@ def test_turns_between_scans_are_exact():
 
 def test_overlapping_turns_are_refused():
     turns = [{"start": 0.0, "duration": 5.0, "rate": 0.1}, {"start": 4.0, "duration": 5.0, "rate": 0.1}]
-    with pytest.raises(ValidationError, match="turn 1 starts at 4 s, before the end"):
+    with pytest.raises(ValidationError, match="turn 2 starts at 4 s, before the end"):
         CoordinatedTurnsSettings.model_validate({**TURNING, "turns": turns})

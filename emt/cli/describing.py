@@ -15,7 +15,7 @@ def list_names() -> None:
     from emt.config.load import find_config
     from emt.config.shipped import config_names
     from emt.config.source import load_source
-    from emt.metrics.base import METRICS
+    from emt.metrics.base import FAMILIES, METRICS
     from emt.registry import FILTERS, SCENARIOS
     from emt.reports.table import Column, Table
 
@@ -24,7 +24,8 @@ def list_names() -> None:
         (registry.what + "s", [(name, first_line(registry.get(name).settings.__doc__)) for name in registry.builtin()])
         for registry in (FILTERS, SCENARIOS)
     ]
-    metrics = [(m.name, f"{m.definition} [{m.unit}]") for _, m in sorted(METRICS.items())]
+    families = {pattern: make("NAME")._replace(name=pattern) for pattern, make in FAMILIES.items()}
+    metrics = [(m.name, f"{m.definition} [{m.unit}]") for _, m in sorted((METRICS | families).items())]
     for title, rows in [("experiments", experiments), *kinds, ("metrics (L: length unit)", metrics)]:
         columns = [Column("name", "name"), Column("what", "what it is")]
         cells = [{"name": name, "what": what} for name, what in rows]

@@ -163,7 +163,8 @@ def compared(batch: Batch, trials: list[Any], runs: Literal["tuning", "reporting
 
 def sweep(loaded: Loaded, parameters: Sequence[Parameter], batch: Batch, plan: Plan, tell: OnProgress) -> list[Tried]:
     """The start and every point of the grid."""
-    points = [tuple(p.start for p in parameters), *combinations(parameters)]
+    start = tuple(p.start for p in parameters)
+    points = [start, *(point for point in combinations(parameters) if point != start)]
     trials = [build_trial(candidate(loaded, parameters, values).experiment, batch.label) for values in points]
     tell(f"compiling; {len(points)} candidates on {plan.tuning_runs} runs each")
     scores = batch.score(trials, lambda done: tell(f"{done}/{len(points)} candidates"))

@@ -7,15 +7,22 @@ from pathlib import Path
 from typing import Any
 
 
+def cache_folder() -> Path | None:
+    """Where compiled programs and sample sets are kept: EMT_CACHE, or the user's cache folder; None if it is `off`."""
+    from platformdirs import user_cache_dir
+
+    folder = os.environ.get("EMT_CACHE", user_cache_dir("emt"))
+    return None if folder == "off" else Path(folder)
+
+
 def configure() -> None:
     """Turns on double precision and the persistent compilation cache (EMT_CACHE names another folder, or `off`)."""
     import jax
-    from platformdirs import user_cache_dir
 
     jax.config.update("jax_enable_x64", True)
-    folder = os.environ.get("EMT_CACHE", user_cache_dir("emt"))
-    if folder != "off":
-        jax.config.update("jax_compilation_cache_dir", folder)
+    folder = cache_folder()
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

@@ -18,6 +18,7 @@ from emt.conformance.golden import (
     scan_of,
     time_step,
 )
+from emt.conformance.sampling_kinds import compare_lcd_samples, compare_s2kf_updates
 from emt.conformance.shape_kinds import compare_ellipse_iou, compare_gaussian_wasserstein, compare_moment_update
 from emt.filters import feldmann, gp_ett
 from emt.filters import mem_ekf_star as mem
@@ -287,6 +288,8 @@ KINDS = {
     "mem_ekf_star": Kind(compare_mem_ekf_star, DEFAULT_TOLERANCE),
     "feldmann_rm": Kind(compare_feldmann, DEFAULT_TOLERANCE),
     "gp_ett": Kind(compare_gp_ett, 1e-6),
+    "lcd_samples": Kind(compare_lcd_samples, 1e-10),
+    "s2kf_updates": Kind(compare_s2kf_updates, 1e-10),
     "moment_update": Kind(compare_moment_update, 1e-12),
     "ellipse_iou": Kind(compare_ellipse_iou, 1e-6),
     "gaussian_wasserstein": Kind(compare_gaussian_wasserstein, DEFAULT_TOLERANCE),

@@ -27,7 +27,16 @@ def test_moment_vectors_are_made_by_their_program():
         assert {key: moment_update_exact.plain(value) for key, value in case.items()} == kept
 
 
-FULL = ["vb_update", "mem_ekf_star", "feldmann_rm", "gp_ett", "ellipse_iou", "gaussian_wasserstein"]
+FULL = [
+    "vb_update",
+    "mem_ekf_star",
+    "feldmann_rm",
+    "gp_ett",
+    "ellipse_iou",
+    "gaussian_wasserstein",
+    "lcd_samples",
+    "s2kf_updates",
+]
 
 
 @pytest.mark.parametrize("name", FULL)

@@ -10,7 +10,9 @@ from emt.shapes.connected import ConnectedSettings, connected
 from emt.shapes.linkage import place
 
 ARM = {
-    "parameters": dict(length_a="length", alpha_a="angle", length_b="length", alpha_b="angle", alpha_c="angle"),
+    "parameters": {
+        "length_a": "length", "alpha_a": "angle", "length_b": "length", "alpha_b": "angle", "alpha_c": "angle",
+    },
     "components": {
         "hub": {"kind": "disc", "radius": "30 cm"},
         "finger_1": {"kind": "segment", "after": "lower", "length": 0.75, "angle": {"alpha_c": 0.5}},

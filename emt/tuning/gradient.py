@@ -11,7 +11,7 @@ import optax
 
 from emt.config.load import Loaded
 from emt.tuning.parameters import Parameter, candidate
-from emt.tuning.scoring import Batch
+from emt.tuning.scoring import Batch, Data
 from emt.tuning.trial import Built, Trial, build_trial
 
 STEP = 1e-4
@@ -51,13 +51,13 @@ class Descent:
         values = [p.value(float(t)) for p, t in zip(self.parameters, theta, strict=True)]
         return build_trial(candidate(self.loaded, self.parameters, values).experiment, self.batch.label)
 
-    def value(self, trial: Trial) -> tuple[jax.Array, jax.Array]:
+    def value(self, trial: Trial, data: Data) -> tuple[jax.Array, jax.Array]:
         """The metric over the sound runs, and how many failed."""
-        shares, sound = self.batch.shares(self.built.make, trial)
+        shares, sound = self.batch.shares(self.built.make, trial, data)
         used = jnp.maximum(sound.sum(dtype=shares.dtype), 1.0)
         return shares[0].sum() / used, (~sound).sum()
 
-    def _slopes(self, trial: Trial, tangents: Trial):
+    def _slopes(self, trial: Trial, tangents: Trial, data: Data):
         leaves, structure = jax.tree.flatten(trial)
         moves = jax.tree.leaves(tangents)
         is_float = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
@@ -65,7 +65,7 @@ class Descent:
         def of_floats(floats):
             rest = iter(floats)
             full = [next(rest) if real else leaf for leaf, real in zip(leaves, is_float, strict=True)]
-            return self.value(jax.tree.unflatten(structure, full))
+            return self.value(jax.tree.unflatten(structure, full), data)
 
         floats = [leaf for leaf, real in zip(leaves, is_float, strict=True) if real]
 
@@ -83,7 +83,7 @@ class Descent:
             ahead, behind = (self.trial(theta + sign * STEP * np.eye(len(theta))[k]).trial for sign in (1.0, -1.0))
             tangents.append(jax.tree.map(lambda a, b: (a - b) / (2.0 * STEP), ahead, behind))
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tangents)
-        value, failed, gradient = self._compiled(self.trial(theta).trial, stacked)
+        value, failed, gradient = self._compiled(self.trial(theta).trial, stacked, self.batch.data)
         return Point(theta, float(value), np.asarray(gradient, float), int(failed))
 
     def run(self, steps: int, rate: float, on_progress: Callable[[int, Point], None]) -> list[Point]:

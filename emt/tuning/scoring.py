@@ -18,6 +18,7 @@ from emt.montecarlo.run import as_truth
 from emt.runner import build_program
 from emt.status import FAILURE
 from emt.tuning.trial import Built, Trial, grouped
+from emt.types import Measurements, Truth
 
 LANES = 208
 """Filters computed together; see `MonteCarlo.chunk`."""
@@ -71,6 +72,15 @@ def shares_of(metric: Metric, rows: jax.Array, sound: jax.Array) -> jax.Array:
     return jnp.where(sound, jnp.sqrt(means) if metric.over_time == "rms" else means, 0.0)
 
 
+class Data(NamedTuple):
+    """Runs that candidates are scored on; an argument of compiled functions, in which it would be a huge constant."""
+
+    seed: jax.Array
+    runs: jax.Array
+    scans: Measurements
+    target: Truth
+
+
 class Batch:
     """Simulated runs on which candidates for one filter are scored.
 
@@ -84,24 +94,20 @@ class Batch:
     def __init__(self, loaded: Loaded, label: str, metrics: Sequence[Metric], first: int, count: int):
         self.label, self.metrics = label, tuple(metrics)
         self.program = dataclasses.replace(build_program(loaded), metrics=self.metrics)
-        self.seed = jnp.asarray(loaded.experiment.monte_carlo.seed)
-        self.runs = first + jnp.arange(count)
         program, reference = self.program, loaded.experiment.reference
-        simulation = program.simulator()(program.world, self.seed, self.runs)
-        self.scans, self.target = simulation.scans, simulation.truth
+        seed, runs = jnp.asarray(loaded.experiment.monte_carlo.seed), first + jnp.arange(count)
+        simulation = program.simulator()(program.world, seed, runs)
+        self.data = Data(seed, runs, simulation.scans, simulation.truth)
         if reference != "truth":
-            params = program.filter_params[reference]
-            scores = program.scorer(reference)(program.world, params, self.seed, self.runs, self.scans, self.target)
-            self.target = jax.vmap(as_truth)(scores.track)
+            scores = program.scorer(reference)(program.world, program.filter_params[reference], *self.data)
+            self.data = self.data._replace(target=jax.vmap(as_truth)(scores.track))
 
-    def shares(self, make: Callable[..., Any], trial: Trial) -> tuple[jax.Array, jax.Array]:
+    def shares(self, make: Callable[..., Any], trial: Trial, data: Data) -> tuple[jax.Array, jax.Array]:
         """Shares (metric, run) and soundness (run) of one candidate; to be compiled."""
         program = dataclasses.replace(self.program, make_filter={self.label: make})
         world = program.world._replace(model=trial.model, prior=trial.prior)
         one = partial(program.score_run, self.label)
-        scores = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))(
-            world, trial.params, self.seed, self.runs, self.scans, self.target
-        )
+        scores = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))(world, trial.params, *data)
         sound = (scores.status & int(FAILURE)) == 0
         rows = scores.per_step[:, program.experiment.skip_steps :]
         return jnp.stack([shares_of(m, rows[:, :, k], sound) for k, m in enumerate(self.metrics)]), sound
@@ -113,13 +119,13 @@ class Batch:
         results: list[list[Score]] = [[] for _ in trials]
         done = 0
         for group in grouped(list(trials)):
-            together = max(1, min(LANES // len(self.runs), len(group)))
-            compiled = jax.jit(jax.vmap(partial(self.shares, trials[group[0]].make)))
+            together = max(1, min(LANES // len(self.data.runs), len(group)))
+            compiled = jax.jit(jax.vmap(partial(self.shares, trials[group[0]].make), in_axes=(0, None)))
 
             def one(members: list[int], compiled=compiled, together=together):
                 padded = members + [members[-1]] * (together - len(members))
                 stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(trials[k].trial for k in padded))
-                return members, jax.block_until_ready(compiled(stacked))
+                return members, jax.block_until_ready(compiled(stacked, self.data))
 
             parts = [group[k : k + together] for k in range(0, len(group), together)]
             finished = [one(parts[0])]  # the first one compiles

@@ -95,7 +95,10 @@ def test_slopes_are_those_of_finite_differences(moments, metric):
     slopes = descent.at(theta).gradient
     value = jax.jit(descent.value)
     for k, slope in enumerate(slopes):
-        ends = [float(value(descent.trial(theta + h * np.eye(3)[k]).trial)[0]) for h in (-2e-4, -1e-4, 1e-4, 2e-4)]
+        ends = [
+            float(value(descent.trial(theta + h * np.eye(3)[k]).trial, batch.data)[0])
+            for h in (-2e-4, -1e-4, 1e-4, 2e-4)
+        ]
         expected = (ends[0] - 8.0 * ends[1] + 8.0 * ends[2] - ends[3]) / 12e-4
         assert slope == pytest.approx(expected, rel=1e-6, abs=1e-9), k
         assert slope != 0.0

@@ -1,6 +1,7 @@
 """README, notes and tracked tables say what is so."""
 
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from emt.config.load import load_experiment
 from emt.montecarlo.chunks import Engine
 from emt.montecarlo.program import Program
+from emt.tuning.parameters import candidate, combinations, label_of, parse_parameters
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -52,6 +54,20 @@ def test_the_filter_in_readme_works_like_any_other(beside):
     nees = arrays["nearest/values"][:, 4]
     assert 0.5 < np.mean(nees) < 8.0
     assert jnp.isfinite(arrays["nearest/values"]).all()
+
+
+def test_the_searches_in_readme_are_possible(beside):
+    loaded = load_experiment(str(beside / "mine.yaml"))
+    commands = [shlex.split(line, comments=True)[2:] for line in README.splitlines() if "emt tune mine.yaml" in line]
+    assert len(commands) == 3
+    for command in commands:
+        named = [text for text in command[1:] if "." in text]
+        grid = "gradient" not in command
+        parameters = parse_parameters(named, loaded, grid)
+        assert label_of(parameters, "vb" if "--filter" in command else None, loaded) in ("vb", "vb_3")
+        points = combinations(parameters) if grid else []
+        for values in points[:1] + points[-1:]:
+            candidate(loaded, parameters, values)
 
 
 def test_the_excerpt_in_readme_stands_in_the_report():

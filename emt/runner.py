@@ -14,6 +14,7 @@ from emt.config.load import Loaded, problem_at
 from emt.device import configure, environment
 from emt.montecarlo.chunks import Engine, without_tracks
 from emt.montecarlo.program import Program
+from emt.reports.connected_art import animation, is_connected
 from emt.reports.estimates import estimates_table
 from emt.reports.figures import over_time_figure, replay_figure, track_figure
 from emt.reports.published import summary_table
@@ -74,15 +75,28 @@ def build_program(loaded: Loaded) -> Program:
     """
     configure()
     try:
-        return Program.of(loaded.experiment)
+        program = Program.of(loaded.experiment)
     except DataError as error:
         raise ConfigError([problem_at(loaded.source, ("scenario", error.key), str(error))]) from error
+    labels = list(program.filter_params)
+    problems = [
+        problem_at(loaded.source, ("metrics", k), f"no filter of this experiment has '{metric.name}'")
+        for k, metric in enumerate(program.metrics)
+        if labels != [loaded.experiment.reference] and program.without(metric) == labels
+    ]
+    if problems:
+        raise ConfigError(problems)
+    return program
 
 
 def metric_facts(program: Program) -> list[dict[str, Any]]:
     """Name, unit, definition, averaging of the metrics, and the filters without it, as plain data."""
-    shown = ("name", "unit", "better", "definition", "over_time", "over_runs")
-    return [{name: getattr(m, name) for name in shown} | {"without": program.without(m)} for m in program.metrics]
+    shown = ("name", "better", "definition", "over_time", "over_runs")
+    return [
+        {name: getattr(m, name) for name in shown}
+        | {"unit": program.unit_of(m), "counted": m.counts is not None, "without": program.without(m)}
+        for m in program.metrics
+    ]
 
 
 def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
@@ -102,6 +116,7 @@ def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
         "title": experiment.title,
         "length_unit": experiment.length_unit,
         "steps": program.n_steps,
+        "state": program.state_names(),
         "maneuvers": [list(interval) for interval in getattr(experiment.scenario, "maneuvers", ())],
         "has_truth": experiment.scenario.has_truth,
     }
@@ -196,6 +211,8 @@ def write_reports(folder: RunFolder, first_run: dict[str, np.ndarray]) -> dict[s
     if first_run:
         title = f"{manifest['title'] or summary['experiment']}: run 0"
         folder.write_bytes(TRACK_FIGURE, track_figure(first_run, labels, length_unit=unit, title=title))
+        if is_connected(first_run):
+            folder.write_bytes("animation.gif", animation(first_run, labels, title=labels[0]))
     return summary
 
 
@@ -225,4 +242,5 @@ def replay(loaded: Loaded, run: int) -> Replay:
     labels, unit = list(loaded.experiment.filters), loaded.experiment.length_unit
     title = f"{loaded.experiment.title or loaded.name}: run {run}"
     figure = replay_figure(arrays, labels, metrics, length_unit=unit, title=title)
-    return Replay(figure, steps_table(arrays, labels, metrics), overview_table(arrays, labels, metrics, title, unit))
+    overview = overview_table(arrays, labels, metrics, title, unit)
+    return Replay(figure, steps_table(arrays, labels, metrics, program.state_names()), overview)

@@ -14,6 +14,8 @@ class Status(IntFlag):
     FLOOR_USED = 32
     SCAN_OVERFLOW = 64
     MOMENTS_PROJECTED = 128
+    LOST = 256
+    """Lost by the experiment's rule, but kept in the averages."""
 
     @classmethod
     def names_of(cls, bits: int) -> list[str]:

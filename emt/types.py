@@ -5,8 +5,11 @@ Lengths are metres unless an experiment declares another length unit; angles are
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 Scalar = Float[Array, ""]
@@ -25,6 +28,8 @@ class Measurements(NamedTuple):
     """True where a real detection sits."""
     overflow: Bool[Array, ""]
     """True if the scan had more points than the capacity."""
+    sources: Int[Array, "max_points"] | None = None
+    """Component of a connected object that each point comes from, -1 for clutter; only simulation knows it."""
 
 
 class Ellipse(NamedTuple):
@@ -43,16 +48,48 @@ class StarConvex(NamedTuple):
     orientation: Scalar
 
 
+@register_dataclass
+@dataclass(frozen=True)
+class Articulated:
+    """Connected object, by the lengths and angles in its state."""
+
+    parameters: Float[Array, "n"]
+    plan: Any = field(metadata={"static": True})
+    """What it is made of: a `shapes.connected.Connected`, fixed when a program is compiled."""
+
+
 class Truth(NamedTuple):
     """True object at one step."""
 
-    position: Float[Array, "2"]
-    velocity: Float[Array, "2"]
-    ellipse: Ellipse
+    state: Float[Array, "n"]
+    """Of an ellipse: position (m) and velocity (m/s) x, y, vx, vy. Of a connected object: its parameters."""
+    shape: Ellipse | Articulated
+
+    @staticmethod
+    def moving(position: Float[Array, "2"], velocity: Float[Array, "2"], ellipse: Ellipse) -> "Truth":
+        """An ellipse on its way."""
+        return Truth(jnp.concatenate([position, velocity], axis=-1), ellipse)
+
+    @property
+    def position(self) -> Float[Array, "2"]:
+        """Position of an ellipse (m)."""
+        return self.state[..., :2]
+
+    @property
+    def velocity(self) -> Float[Array, "2"]:
+        """Velocity of an ellipse (m/s)."""
+        return self.state[..., 2:4]
+
+    @property
+    def ellipse(self) -> Ellipse:
+        """The shape of an object that is an ellipse."""
+        if not isinstance(self.shape, Ellipse):
+            raise TypeError("this object is no ellipse")
+        return self.shape
 
 
 class Prior(NamedTuple):
-    """What every filter is told before the first scan."""
+    """What every filter of an ellipse is told before the first scan."""
 
     mean: Float[Array, "4"]
     """Position (m) and velocity (m/s): x, y, vx, vy."""
@@ -64,13 +101,20 @@ class Prior(NamedTuple):
     """Its variance (rad²/s²)."""
 
 
+class StatePrior(NamedTuple):
+    """What every filter of another object is told before the first scan."""
+
+    mean: Float[Array, "n"]
+    cov: Float[Array, "n n"]
+
+
 class Estimate(NamedTuple):
     """What a filter reports; the only thing metrics see of it."""
 
-    mean: Float[Array, "4"]
-    """Position (m) and velocity (m/s): x, y, vx, vy."""
-    cov: Float[Array, "4 4"]
-    shape: Ellipse | StarConvex
+    mean: Float[Array, "n"]
+    """Of an ellipse: position (m) and velocity (m/s) x, y, vx, vy. Of a connected object: its parameters."""
+    cov: Float[Array, "n n"]
+    shape: Ellipse | StarConvex | Articulated
     modes: dict[str, Scalar] | None = None
     """Probability of each motion mode by name, for multiple-model filters."""
 
@@ -84,12 +128,16 @@ class Info(NamedTuple):
     """Normalised innovation squared of the scan mean; 0 for an empty scan."""
     status: Int[Array, ""]
     """`Status` bits of this step."""
+    confusion: Float[Array, "c c"] | None = None
+    """Points from component i (row) that were given to component j, as sums of association weights; from filters of
+    connected objects where the scan tells the sources."""
 
 
 class Filter(NamedTuple):
     """A tracker: four pure functions of one step of one run."""
 
-    init: Callable[[Prior, PRNGKeyArray], State]
+    init: Callable[[Any, PRNGKeyArray], State]
+    """(prior, key) -> state; the prior is a `Prior` for ellipses, else a `StatePrior`."""
     predict: Callable[[State, Scalar, PRNGKeyArray], State]
     """(state, seconds since the last step, key) -> predicted state."""
     update: Callable[[State, Measurements, PRNGKeyArray], tuple[State, Info]]

@@ -15,6 +15,7 @@ from pydantic import (
 import emt.filters.catalogue
 import emt.metrics.catalogue
 import emt.scenarios.catalogue  # noqa: F401  (these three fill the registries)
+from emt.config.connected_model import ConnectedModelSettings
 from emt.metrics.base import find_metric
 from emt.registry import FILTERS, SCENARIOS, Entry, Registry
 from emt.settings import (
@@ -141,11 +142,17 @@ class Divergence(Settings):
     """At any scan."""
     final_iou_below: Fraction | None = None
     """Intersection over union at the last scan."""
+    final_mean_above: dict[MetricName, PositiveFloat] = Field(default_factory=dict)
+    """Means over the last steps of metrics of the experiment, in SI units."""
+    last_steps: PositiveInt = 1
+    """Steps at the end for these means."""
+    exclude: bool = True
+    """Whether lost runs leave the averages; if not, they are counted only (metric `lost`)."""
 
     @model_validator(mode="after")
     def _not_empty(self):
-        if self.position_error_above is None and self.final_iou_below is None:
-            raise ValueError("give position_error_above, final_iou_below or both")
+        if self.position_error_above is None and self.final_iou_below is None and not self.final_mean_above:
+            raise ValueError("give position_error_above, final_iou_below or final_mean_above")
         return self
 
 
@@ -192,6 +199,12 @@ class Experiment(Settings):
         return self.monte_carlo.chunk or (208 if self.scenario.has_truth else 1)
 
 
+class ConnectedExperiment(Experiment):
+    """An experiment on a connected object."""
+
+    model: ConnectedModelSettings  # type: ignore[assignment]
+
+
 def model_for(data: Any) -> type[Experiment]:
     """The settings class for a file's content: `Experiment`, widened by the plug-ins the file names.
 
@@ -200,17 +213,19 @@ def model_for(data: Any) -> type[Experiment]:
     """
     if not isinstance(data, dict):
         return Experiment
-    filters, scenario = data.get("filters"), data.get("scenario")
+    filters, scenario, model = data.get("filters"), data.get("scenario"), data.get("model")
+    is_connected = isinstance(model, dict) and model.get("kind") == "connected"
     named = [f.get("kind") for f in filters.values() if isinstance(f, dict)] if isinstance(filters, dict) else []
     plugin_filters = _plugins(FILTERS, named)
     plugin_scenarios = _plugins(SCENARIOS, [scenario.get("kind")] if isinstance(scenario, dict) else [])
+    base = ConnectedExperiment if is_connected else Experiment
     if not plugin_filters and not plugin_scenarios:
-        return Experiment
+        return base
     widened: Any = {
         "filters": (Annotated[dict[Label, union_of(FILTERS, plugin_filters)], Field(min_length=1)], ...),
         "scenario": (union_of(SCENARIOS, plugin_scenarios), ...),
     }
-    return create_model("Experiment", __base__=Experiment, **widened)
+    return create_model("Experiment", __base__=base, **widened)
 
 
 def _plugins(registry: Registry[Any], named: list[Any]) -> tuple[str, ...]:

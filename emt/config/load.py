@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from emt.config.connected_model import ConnectedModelSettings
 from emt.config.errors import ConfigError, Problem, dotted, validate
 from emt.config.experiment import Experiment, model_for
 from emt.config.overrides import apply_overrides
@@ -142,6 +143,7 @@ def contradictions(experiment: Experiment, source: Source) -> Iterable[Problem]:
     if experiment.reference not in labels:
         name = UnknownName(experiment.reference, labels, suggest(experiment.reference, labels), "reference")
         yield problem_at(source, ("reference",), str(name))
+    yield from mismatches(experiment, source)
     if not experiment.scenario.has_truth:
         if experiment.metrics and experiment.reference == "truth":
             message = "this scenario has no ground truth: set metrics: [] or name a filter as reference"
@@ -157,6 +159,31 @@ def contradictions(experiment: Experiment, source: Source) -> Iterable[Problem]:
         for k, key in enumerate(keys):
             if not has_key(resolved, key.split(".")):
                 yield problem_at(source, ("sources", group, k), f"'{key}' is not a setting of this file")
+
+
+def mismatches(experiment: Experiment, source: Source) -> Iterable[Problem]:
+    """Scenario, filters, metrics and model that are not about the same kind of object."""
+    model = experiment.model
+    kind = getattr(model, "kind", "ellipse")
+    what = {"ellipse": "an ellipse", "connected": "a connected object"}
+    parts = [(("scenario",), experiment.scenario)]
+    parts += [(("filters", label), settings) for label, settings in experiment.filters.items()]
+    for path, settings in parts:
+        theirs = getattr(settings, "tracks", "ellipse")
+        if theirs != kind:
+            message = f"'{settings.kind}' is about {what[theirs]}, the model about {what[kind]}"
+            yield problem_at(source, (*path, "kind"), message)
+        elif isinstance(model, ConnectedModelSettings) and hasattr(settings, "faults_with"):
+            for key, fault in settings.faults_with(model.shape, model.noise_cov):
+                yield problem_at(source, (*path, key), fault)
+    rule = experiment.divergence
+    if kind != "ellipse" and rule is not None and (rule.position_error_above or rule.final_iou_below) is not None:
+        yield problem_at(source, ("divergence",), "position and IoU are those of an ellipse; use final_mean_above")
+    if kind != "ellipse" and experiment.reference != "truth":
+        yield problem_at(source, ("reference",), "connected objects are compared with the truth only")
+    for name in rule.final_mean_above if rule is not None else ():
+        if name not in experiment.metrics:
+            yield problem_at(source, ("divergence", "final_mean_above", name), "is not among the metrics")
 
 
 def has_key(data: Any, path: Sequence[str]) -> bool:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from emt.conformance.golden import Quantity, array
-from emt.filters.association import component_updates, weighted
+from emt.filters.association import Samples, evidence, updated, weighted
 from emt.filters.sampling_update import conditioned, sampled_moments
-from emt.linalg import Vec2, cholesky
+from emt.linalg import Sym2, Vec2, cholesky
 from emt.sampling.lcd import parts, standardised, symmetric_set
 from emt.shapes.connected import ConnectedSettings, connected
 from emt.shapes.linkage import Link, place, segment_residual
@@ -125,13 +125,16 @@ def _compare_step(case: dict) -> Iterator[Quantity]:
     x, cov, samples = (array(case[name]) for name in ("x", "P", "std_normal_samples"))
     move = np.eye(8)
     move[[1, 4, 6], [2, 5, 7]] = 1.0
+    even = Samples(samples, jnp.full(len(samples), 1.0 / len(samples)))
+    noise = array(case["sigma2"]) * Sym2.of(jnp.eye(2))
     x, cov = jnp.asarray(move) @ x, jnp.asarray(move) @ cov @ jnp.asarray(move).T + case["q"] * jnp.eye(8)
-    parts = component_updates(x, cov, Vec2.of(array(case["y"])), array(case["sigma2"]), samples, ARM)
-    weights, mean, cov = weighted(parts, jnp.full(5, -np.log(5.0)))
+    found = evidence(x, cov, Vec2.of(array(case["y"])), noise, even, ARM)
+    weights = weighted(found, jnp.full(5, -np.log(5.0)))
+    mean, cov = updated(x, cov, found, weights)
     expected = case["expected"]
-    yield Quantity("log likelihoods", parts.log_density, expected["log_lik"])
+    yield Quantity("log likelihoods", found.log_density, expected["log_lik"])
     distances = [np.dot(h, np.linalg.solve(S, h)) for h, S in zip(expected["h_means"], expected["h_covs"], strict=True)]
-    yield Quantity("squared distances", parts.distance, distances)
+    yield Quantity("squared distances", found.distance, distances)
     yield Quantity("association weights", weights, expected["weights"], scale=1.0)
     yield Quantity("state after a step", mean, expected["x"])
     yield Quantity("covariance after a step", cov, expected["P"])

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
 from emt.models.motion import MotionNoise
 from emt.status import Status
-from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Scalar, State, Traced
+from emt.types import Articulated, Ellipse, Estimate, Filter, Info, Measurements, Scalar, State, Traced
 
 GROSS_INNOVATION = 10.0
 """An innovation of more than this many predicted standard deviations sets `Status.GROSS_INNOVATION`."""
@@ -95,7 +95,7 @@ def screen(scan: Measurements) -> tuple[Measurements, Bool[Array, ""]]:
     sound = (jnp.abs(scan.points) < limit).all(axis=1)  # False for NaN
     mask = scan.mask & sound
     points = jnp.where(mask[:, None], scan.points, 0.0)
-    return Measurements(points, mask, scan.overflow), (scan.mask & ~sound).any()
+    return scan._replace(points=points, mask=mask), (scan.mask & ~sound).any()
 
 
 def keep_if(condition: Bool[Array, ""], new, old):
@@ -104,7 +104,14 @@ def keep_if(condition: Bool[Array, ""], new, old):
 
 
 def estimate_status(estimate: Estimate) -> Int[Array, ""]:
-    """Status bits of what a filter is about to report: finite, covariances and extent positive definite."""
+    """Status bits of what a filter is about to report: finite, covariances and extent positive definite.
+
+    Of a general state only the variances are looked at: the next factorisation shows the rest.
+    """
+    if isinstance(estimate.shape, Articulated):
+        sound = (jnp.diagonal(estimate.cov) > 0.0).all()
+        bits = jnp.where(sound, 0, int(Status.NOT_POSITIVE_DEFINITE))
+        return jnp.where(all_finite(estimate), bits, int(Status.NON_FINITE))
     sound = is_positive_definite(Sym2.of(estimate.cov[:2, :2])) & is_positive_definite(Sym2.of(estimate.cov[2:, 2:]))
     if isinstance(estimate.shape, Ellipse):
         sound = sound & (estimate.shape.semi_axes > 0.0).all()
@@ -146,8 +153,10 @@ def guarded(flt: Filter) -> Filter:
         status = status | jnp.where(scan.overflow, int(Status.SCAN_OVERFLOW), 0)
         finite = jnp.isfinite(info.log_likelihood) & jnp.isfinite(info.nis)
         status = status | jnp.where(finite, 0, int(Status.FLOOR_USED))
-        return Guarded(state, state), Info(
-            jnp.where(finite, info.log_likelihood, 0.0), jnp.where(finite, info.nis, 0.0), status
+        return Guarded(state, state), info._replace(
+            log_likelihood=jnp.where(finite, info.log_likelihood, 0.0),
+            nis=jnp.where(finite, info.nis, 0.0),
+            status=status,
         )
 
     return Filter(init, predict, update, lambda guard: flt.estimate(guard.state))

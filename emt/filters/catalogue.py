@@ -8,7 +8,18 @@ from emt.filters import (
     mem_ekf_star,
     moment_ukf,
     sampled_posterior,
+    shape_mixture,
     vb_random_matrix,
 )
 
-__all__ = ["feldmann", "gp_ett", "imm", "lan_li", "mem_ekf_star", "moment_ukf", "sampled_posterior", "vb_random_matrix"]
+__all__ = [
+    "feldmann",
+    "gp_ett",
+    "imm",
+    "lan_li",
+    "mem_ekf_star",
+    "moment_ukf",
+    "sampled_posterior",
+    "shape_mixture",
+    "vb_random_matrix",
+]

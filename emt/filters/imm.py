@@ -1,6 +1,6 @@
 """Interacting multiple models over any filters that can merge their states."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -13,13 +13,13 @@ from pydantic import Field, StringConstraints, model_validator
 from emt.filters.base import TrackingModel
 from emt.filters.lan_li import LanLiSettings
 from emt.filters.moment_ukf import MomentUkfSettings
+from emt.models.switching import ROUNDING, transition_faults
 from emt.registry import FILTERS
 from emt.settings import Fraction, Settings
 from emt.status import Status
-from emt.types import Estimate, Filter, Info, Measurements, Prior, Scalar, State
+from emt.types import Estimate, Filter, Info, Measurements, Scalar, State
 
 ModeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
-ROUNDING = 1e-9
 
 
 class ImmSettings(Settings):
@@ -38,15 +38,7 @@ class ImmSettings(Settings):
 
     @model_validator(mode="after")
     def _consistent(self):
-        n, faults = len(self.modes), []
-        if len(self.transition) != n or any(len(row) != n for row in self.transition):
-            faults.append(f"transition: expected {n} rows of {n} probabilities, one per mode")
-        else:
-            faults += [
-                f"transition: row {i} (from '{name}') sums to {sum(row):.6g}, not 1"
-                for i, (name, row) in enumerate(zip(self.modes, self.transition, strict=True))
-                if abs(sum(row) - 1.0) > ROUNDING
-            ]
+        n, faults = len(self.modes), transition_faults(self.transition, tuple(self.modes))
         if self.start is not None and (len(self.start) != n or abs(sum(self.start) - 1.0) > ROUNDING):
             faults.append(f"start: expected {n} probabilities that sum to 1, got {list(self.start)}")
         families = {name: mode.family for name, mode in self.modes.items()}
@@ -84,7 +76,7 @@ def imm(names: tuple[str, ...], modes: tuple[Filter, ...], params: Params, avera
     """
     log_transition = jnp.log(params.transition)
 
-    def init(prior: Prior, key) -> ImmState:
+    def init(prior, key) -> ImmState:
         return ImmState(jnp.log(params.start), tuple(mode.init(prior, key) for mode in modes))
 
     def predict(state: ImmState, dt: Scalar, key) -> ImmState:
@@ -108,13 +100,7 @@ def imm(names: tuple[str, ...], modes: tuple[Filter, ...], params: Params, avera
         joint = state.log_probability + log_likelihood
         total = logsumexp(joint)
         posterior = joint - total
-        nis = (jnp.exp(posterior) * jnp.stack([info.nis for info in infos])).sum()
-        every = any_ = infos[0].status
-        for info in infos[1:]:
-            every, any_ = every & info.status, any_ | info.status
-        gross = int(Status.GROSS_INNOVATION)  # a scan is gross only if no mode expects it
-        status = (any_ & ~gross) | (every & gross)
-        return ImmState(posterior, tuple(new for new, _ in results)), Info(total, nis, status)
+        return ImmState(posterior, tuple(new for new, _ in results)), pooled(total, jnp.exp(posterior), infos)
 
     def estimate(state: ImmState) -> Estimate:
         probability = jnp.exp(state.log_probability)
@@ -122,6 +108,18 @@ def imm(names: tuple[str, ...], modes: tuple[Filter, ...], params: Params, avera
         return merged._replace(modes={name: probability[k] for k, name in enumerate(names)})
 
     return Filter(init, predict, update, estimate)
+
+
+def pooled(log_likelihood: Scalar, probability: Float[Array, "n"], infos: Sequence[Info]) -> Info:
+    """Diagnostics of a mixture from those of its parts."""
+    nis = (probability * jnp.stack([info.nis for info in infos])).sum()
+    every = any_ = infos[0].status
+    for info in infos[1:]:
+        every, any_ = every & info.status, any_ | info.status
+    gross = int(Status.GROSS_INNOVATION)  # a scan is gross only if no part expects it
+    confusions = [info.confusion for info in infos if info.confusion is not None]
+    confusion = jnp.einsum("k,kij->ij", probability, jnp.stack(confusions)) if confusions else None
+    return Info(log_likelihood, nis, (any_ & ~gross) | (every & gross), confusion)
 
 
 def merge_of(mode: Filter) -> Callable[..., State]:

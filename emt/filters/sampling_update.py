@@ -30,6 +30,8 @@ class Updated(NamedTuple):
     cov: Float[Array, "n n"]
     log_density: Scalar
     """log N(0; mean, cov) of h before the update."""
+    distance: Scalar
+    """Squared Mahalanobis distance of h from zero."""
 
 
 def sampled_moments(
@@ -71,7 +73,7 @@ def conditioned(mean: Float[Array, "n"], cov: Float[Array, "n n"], h: Moments) -
     taken = (gain[:, None, :, None] * h.cov[None, None, :, :] * gain[None, :, None, :]).sum(axis=(-1, -2))
     distance = (h.mean[:, None] * inverse * h.mean[None, :]).sum()
     log_density = -0.5 * (distance + log_det + h.mean.shape[0] * jnp.log(2.0 * jnp.pi))
-    return Updated(moved, cov - taken, log_density)
+    return Updated(moved, cov - taken, log_density, distance)
 
 
 def mixed(log_weights: Float[Array, "c"], means: Float[Array, "c n"], covs: Float[Array, "c n n"]):

@@ -5,14 +5,34 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from emt.registry import UnknownName, suggest
-from emt.types import Estimate, Info, Scalar, Truth
+from emt.types import Articulated, Estimate, Info, Scalar, Truth
+
+
+class Ending(NamedTuple):
+    """How a run ends."""
+
+    estimate: Estimate
+    truth: Truth
+    lost: Scalar
+    """1 if the run counts as lost by the experiment's rule, else 0."""
+
+
+def of_ellipse(estimate: Estimate) -> bool:
+    """Whether a filter tracks an ellipse, or a shape that an ellipse stands for."""
+    return not isinstance(estimate.shape, Articulated)
+
+
+def of_connected(estimate: Estimate) -> bool:
+    """Whether a filter tracks a connected object."""
+    return isinstance(estimate.shape, Articulated)
 
 
 class Metric(NamedTuple):
     """A number per step, and how it is averaged.
 
-    The value of one run is the mean over its steps, or the root of the mean where `over_time` is "rms" (then
-    `per_step` is a squared error). The value of an experiment follows from all runs by `over_runs`:
+    The value of one run is the mean over its steps, each as often as `counts` says; or the root of the mean where
+    `over_time` is "rms" (then `per_step` is a squared error); or what `at_end` makes of its end where it is "end".
+    The value of an experiment follows from all runs by `over_runs`:
 
     - "mean": mean over runs of the value of a run;
     - "std": sample standard deviation over runs of the value of a run;
@@ -25,16 +45,22 @@ class Metric(NamedTuple):
     better: Literal["lower", "higher", "neither"]
     definition: str
     per_step: Callable[[Estimate, Truth, Info], Scalar]
-    over_time: Literal["mean", "rms"] = "mean"
+    over_time: Literal["mean", "rms", "end"] = "mean"
     over_runs: Literal["mean", "std", "rms"] = "mean"
     smooth: str | None = None
     """Metric that `emt tune` follows in its place where it needs a gradient; by default itself."""
-    needs_mode: str | None = None
-    """Only filters with this mode have the metric."""
+    applies_to: Callable[[Estimate], bool] = of_ellipse
+    """Whether a filter that reports such estimates has the metric."""
+    counts: Callable[[Estimate, Truth, Info], Scalar] | None = None
+    """How often a step counts; by default each once."""
+    at_end: Callable[[Ending], Scalar] | None = None
+    unit_of: Callable[[Estimate], str] | None = None
+    """Unit where it depends on what is estimated."""
 
-    def applies_to(self, estimate: Estimate) -> bool:
-        """Whether a filter that reports such estimates has the metric."""
-        return self.needs_mode is None or self.needs_mode in (estimate.modes or {})
+
+def anything(estimate: Estimate) -> bool:
+    """For metrics that every filter has."""
+    return True
 
 
 def of_truth(function: Callable[[Estimate, Truth], Scalar]) -> Callable[[Estimate, Truth, Info], Scalar]:

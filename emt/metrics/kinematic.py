@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from emt.linalg import Mat2, Sym2, Vec2
 from emt.metrics.base import Metric, of_truth, register
 from emt.shapes.ellipse import equivalent_ellipse, major_orientation
-from emt.types import Estimate, Scalar, Truth
+from emt.types import Articulated, Estimate, Scalar, Truth
 
 
 def position_error_squared(estimate: Estimate, truth: Truth) -> Scalar:
@@ -22,6 +22,7 @@ def velocity_error_squared(estimate: Estimate, truth: Truth) -> Scalar:
 
 def orientation_error_squared_deg(estimate: Estimate, truth: Truth) -> Scalar:
     """Square of the raw difference of the orientations (deg²); nothing is wrapped."""
+    assert not isinstance(estimate.shape, Articulated)
     d = (180.0 / jnp.pi) * (estimate.shape.orientation - truth.ellipse.orientation)
     return d * d
 

@@ -11,7 +11,7 @@ def mode_probability(mode: str) -> Metric:
         "neither",
         f"probability of mode '{mode}' after the update, mean over steps",
         lambda estimate, truth, info: (estimate.modes or {})[mode],
-        needs_mode=mode,
+        applies_to=lambda estimate: mode in (estimate.modes or {}),
     )
 
 

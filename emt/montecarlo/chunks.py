@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emt.montecarlo.fields import truth_fields
 from emt.montecarlo.program import Program, Simulation
 from emt.montecarlo.run import Scores, as_truth
 from emt.status import FAILURE
@@ -51,6 +52,7 @@ def score_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
 def track_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
     """Every report of a filter in the first `n` runs of a chunk."""
     fields = scores.track._asdict() | {"per_step": scores.per_step}
+    fields |= fields.pop("shape")
     return {f"{label}/track/{name}": np.asarray(value)[:n] for name, value in fields.items() if value is not None}
 
 
@@ -58,13 +60,8 @@ def scan_arrays(simulation: Simulation, has_truth: bool, n: int) -> dict[str, np
     """Scans, and the truth where there is one, of the first `n` runs of a chunk."""
     arrays = {"scans/points": simulation.scans.points, "scans/mask": simulation.scans.mask}
     if has_truth:
-        truth = simulation.truth
-        arrays |= {
-            "truth/position": truth.position,
-            "truth/velocity": truth.velocity,
-            "truth/semi_axes": truth.ellipse.semi_axes,
-            "truth/orientation": truth.ellipse.orientation,
-        }
+        drawn = jax.vmap(jax.vmap(truth_fields))(jax.tree.map(lambda leaf: leaf[:n], simulation.truth))
+        arrays |= {f"truth/{name}": value for name, value in drawn.items()}
     return {name: np.asarray(value)[:n] for name, value in arrays.items()}
 
 

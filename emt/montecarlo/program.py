@@ -9,16 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emt.config.experiment import Divergence, Experiment, ModelSettings, PriorSettings
-from emt.filters.base import TrackingModel, guarded
+from emt.config.experiment import Experiment
+from emt.filters.base import guarded
 from emt.keys import Purpose, filter_key, purpose_key, run_key
-from emt.linalg import Sym2, cholesky
 from emt.metrics.base import Metric, find_metric
-from emt.models.motion import FixedNoise, WhiteAcceleration
 from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
+from emt.montecarlo.world import drawn_prior, limits_of, model_of, prior_of
 from emt.registry import FILTERS, SCENARIOS
-from emt.shapes.moments import ellipse_of
-from emt.types import Ellipse, Measurements, Prior, Scenario, Truth
+from emt.types import Articulated, Estimate, Measurements, Prior, Scenario, StatePrior, Truth
 
 
 class Simulation(NamedTuple):
@@ -32,8 +30,9 @@ class WorldParams(NamedTuple):
     """Traced numbers that all filters share."""
 
     scenario: Any
-    model: TrackingModel
-    prior: Prior
+    model: Any
+    """A `TrackingModel` or a `ConnectedModel`."""
+    prior: Prior | StatePrior
     limits: Limits
 
 
@@ -45,34 +44,6 @@ def cast(tree, dtype):
         return jnp.asarray(array, dtype if array.dtype.kind == "f" else array.dtype)
 
     return jax.tree.map(leaf, tree)
-
-
-def prior_of(settings: PriorSettings) -> Prior:
-    """The prior of a checked experiment."""
-    if settings.moments is None:
-        ellipse = Ellipse(jnp.asarray(settings.semi_axes), jnp.asarray(settings.orientation))
-    else:
-        n11, n20, n02 = settings.moments
-        ellipse = ellipse_of(Sym2(*(jnp.asarray(n) for n in (n20, n11, n02))))
-    mean, cov = jnp.asarray(settings.mean), jnp.asarray(settings.cov)
-    return Prior(mean, cov, ellipse, settings.turn_rate, settings.turn_rate_variance)
-
-
-def model_of(settings: ModelSettings) -> TrackingModel:
-    """The world model of a checked experiment."""
-    noise = settings.process_noise
-    return TrackingModel(
-        WhiteAcceleration(noise.psd) if noise.kind == "white_acceleration" else FixedNoise.of(noise.cov),
-        Sym2.of(np.array(settings.noise_cov)),
-        settings.extent_scale,
-    )
-
-
-def limits_of(rule: Divergence | None) -> Limits:
-    """The divergence rule of a checked experiment; by default no run diverges."""
-    if rule is None:
-        return Limits(np.inf, None)
-    return Limits(np.inf if rule.position_error_above is None else rule.position_error_above, rule.final_iou_below)
 
 
 @dataclass(frozen=True)
@@ -100,7 +71,7 @@ class Program:
             experiment.scenario, experiment.monte_carlo.runs
         )
         model = experiment.model
-        world = WorldParams(scenario_params, model_of(model), prior_of(model.prior), limits_of(experiment.divergence))
+        world = WorldParams(scenario_params, model_of(model), prior_of(model), limits_of(experiment.divergence))
         built = {label: FILTERS.get(settings.kind).builder(settings) for label, settings in experiment.filters.items()}
         world = cast(world, dtype)
         n_steps = jax.eval_shape(lambda p: make_scenario(p).dt, world.scenario).shape[0]
@@ -128,33 +99,47 @@ class Program:
         dt = self.make_scenario(world.scenario).dt
         return score(tracker, self.rules_for(label), target, scans, dt, key, world.limits)
 
-    def prior_of_run(self, prior: Prior, seed, run) -> Prior:
+    def prior_of_run(self, prior: Prior | StatePrior, seed, run) -> Prior | StatePrior:
         """What the filters are told in one run: the prior itself, or one with a mean drawn from it."""
         if not self.experiment.model.prior.drawn:
             return prior
-        draw = jax.random.normal(purpose_key(run_key(seed, run), Purpose.PRIOR), (5,), prior.mean.dtype)
-        return prior._replace(
-            mean=prior.mean + cholesky(prior.cov) @ draw[:4],
-            turn_rate=prior.turn_rate + jnp.sqrt(prior.turn_rate_var) * draw[4],
-        )
+        return drawn_prior(prior, purpose_key(run_key(seed, run), Purpose.PRIOR))
 
     def rules_for(self, label: str) -> Rules:
         """A reference filter is not compared with itself; it has no metrics."""
         metrics = () if label == self.experiment.reference else self.metrics
-        return Rules(metrics, self.experiment.skip_steps, self.experiment.traces)
+        rule = self.experiment.divergence
+        last, exclude = (rule.last_steps, rule.exclude) if rule is not None else (1, True)
+        return Rules(metrics, self.experiment.skip_steps, self.experiment.traces, last, exclude)
 
     def without(self, metric: Metric) -> list[str]:
         """Labels of the filters that do not have the metric, or are what the others are compared with."""
-
-        def estimate(label: str):
-            flt = self.make_filter[label](self.filter_params[label], self.world.model)
-            return flt.estimate(flt.init(self.world.prior, jax.random.key(0)))
-
         return [
             label
             for label in self.filter_params
-            if label == self.experiment.reference or not metric.applies_to(jax.eval_shape(partial(estimate, label)))
+            if label == self.experiment.reference or not metric.applies_to(self.estimate_of(label))
         ]
+
+    def estimate_of(self, label: str) -> Estimate:
+        """Shapes and names of a filter's reports."""
+
+        def first():
+            flt = self.make_filter[label](self.filter_params[label], self.world.model)
+            return flt.estimate(flt.init(self.world.prior, jax.random.key(0)))
+
+        return jax.eval_shape(first)
+
+    def state_names(self) -> list[str]:
+        """Names of the entries of the filters' means."""
+        shape = self.estimate_of(next(iter(self.filter_params))).shape
+        return list(shape.plan.state) if isinstance(shape, Articulated) else ["x", "y", "vx", "vy"]
+
+    def unit_of(self, metric: Metric) -> str:
+        """Unit of a metric for the filters here."""
+        if metric.unit_of is None:
+            return metric.unit
+        having = [label for label in self.filter_params if label not in self.without(metric)]
+        return metric.unit_of(self.estimate_of(having[0])) if having else metric.unit
 
     def simulator(self) -> Callable[..., Simulation]:
         """Jitted (world, seed, runs) -> Simulation, mapped over runs."""

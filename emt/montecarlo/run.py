@@ -8,37 +8,31 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from emt.filters.base import keep_if
 from emt.keys import start_key, step_key
-from emt.metrics.base import Metric
+from emt.metrics.base import Ending, Metric
 from emt.metrics.iou import iou
-from emt.shapes.ellipse import equivalent_ellipse
+from emt.montecarlo.fields import Fields, estimate_fields
 from emt.status import FAILURE, Status
-from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, StarConvex, State, Traced, Truth
+from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, State, StatePrior, Traced, Truth
 
 
 class Track(NamedTuple):
     """What a filter reported, with a leading time axis."""
 
-    mean: Float[Array, "n_steps 4"]
-    """x, y, vx, vy (m, m/s)."""
-    center: Float[Array, "n_steps 2"]
-    """Centre of the reported shape (m); the mean position, except for shapes with an offset of their own."""
-    semi_axes: Float[Array, "n_steps 2"]
-    """Semi-axes of the shape or of its equivalent ellipse (m)."""
-    orientation: Float[Array, "n_steps"]
-    """Direction of the first of these axes (rad), not wrapped."""
+    mean: Float[Array, "n_steps n"]
+    """State, as the filter's estimate gives it."""
+    shape: Fields
+    """See `fields.estimate_fields`."""
     nis: Float[Array, "n_steps"]
     status: Int[Array, "n_steps"]
-    cov: Float[Array, "n_steps 4 4"] | None
+    cov: Float[Array, "n_steps n n"] | None
     """Covariance of the mean, on request."""
-    radii: Float[Array, "n_steps n_angles"] | None
-    """Radii of a star-convex shape, on request."""
 
 
 class Scores(NamedTuple):
     """Scores of one filter in one run."""
 
     values: Float[Array, "n_metrics"]
-    """Each metric over the steps of the run; 0 for a metric the filter does not have."""
+    """Each metric of the run; 0 for a metric the filter does not have."""
     per_step: Float[Array, "n_steps n_metrics"]
     status: Int[Array, ""]
     """`Status` bits, or-ed over the steps."""
@@ -52,7 +46,7 @@ class Tracker(NamedTuple):
 
     flt: Filter
     """Guarded (see `filters.base.guarded`)."""
-    prior: Prior
+    prior: Prior | StatePrior
     predict_first: bool
 
 
@@ -69,32 +63,25 @@ def advance(
 
 def report(estimate: Estimate, info: Info, status: Int[Array, ""], full: bool) -> Track:
     """One step of a track."""
-    offset, ellipse = equivalent_ellipse(estimate.shape)
-    radii = estimate.shape.radii if full and isinstance(estimate.shape, StarConvex) else None
-    return Track(
-        estimate.mean,
-        estimate.mean[:2] + offset,
-        ellipse.semi_axes,
-        ellipse.orientation,
-        info.nis,
-        status,
-        estimate.cov if full else None,
-        radii,
-    )
+    shape = estimate_fields(estimate, full)
+    return Track(estimate.mean, shape, info.nis, status, estimate.cov if full else None)
 
 
 def as_truth(track: Track) -> Truth:
     """A track in the role of the truth, for experiments that compare with a reference filter."""
-    return Truth(track.center, track.mean[:, 2:], Ellipse(track.semi_axes, track.orientation))
+    shape = track.shape
+    return Truth.moving(shape["center"], track.mean[:, 2:], Ellipse(shape["semi_axes"], shape["orientation"]))
 
 
 class Limits(NamedTuple):
-    """When a run counts as diverged."""
+    """When a run counts as lost; each rule may be missing."""
 
-    position_error: Traced
+    position_error: Traced | None = None
     """A larger error at any scan (m)."""
-    final_iou: Traced | None
+    final_iou: Traced | None = None
     """A smaller intersection over union at the last scan."""
+    final_means: dict[str, Traced] | None = None
+    """A larger mean of a metric, by its name, over the last steps."""
 
 
 class Rules(NamedTuple):
@@ -105,6 +92,10 @@ class Rules(NamedTuple):
     """Steps before it do not count in the values of a run."""
     full: bool
     """Whether tracks hold covariances and radii."""
+    last_steps: int = 1
+    """Steps at the end over which `Limits.final_means` are taken."""
+    exclude_lost: bool = True
+    """Whether lost runs fail, and so leave the averages; they are only counted otherwise."""
 
 
 def score(
@@ -120,37 +111,62 @@ def score(
 
     Args:
         truth: what estimates are compared with, with a leading time axis.
-        limits: what marks the run as diverged.
+        limits: what marks the run as lost.
     """
+    lost_bit = int(Status.DIVERGED if rules.exclude_lost else Status.LOST)
+
+    def values_of(estimate: Estimate, now: Truth, info: Info) -> Float[Array, "n_metrics"]:
+        row = [
+            metric.per_step(estimate, now, info) if metric.applies_to(estimate) else jnp.zeros((), dt.dtype)
+            for metric in rules.metrics
+        ]
+        return jnp.stack(row) if row else jnp.zeros(0, dt.dtype)
+
+    def counts_of(estimate: Estimate, now: Truth, info: Info) -> dict[int, Scalar]:
+        counted = {k: metric.counts for k, metric in enumerate(rules.metrics) if metric.applies_to(estimate)}
+        return {k: counts(estimate, now, info) for k, counts in counted.items() if counts is not None}
 
     def step(carry, xs):
         state, seen, failed = carry
         k, scan, dt_k, now = xs
         state, info = advance(tracker, state, k, scan, dt_k, key)
         estimate = tracker.flt.estimate(state)
-        row = [
-            metric.per_step(estimate, now, info) if metric.applies_to(estimate) else jnp.zeros((), dt.dtype)
-            for metric in rules.metrics
-        ]
-        row = jnp.stack(row) if row else jnp.zeros(0, dt.dtype)
+        row = values_of(estimate, now, info)
         finite = jnp.isfinite(row).all()
-        dx, dy = estimate.mean[0] - now.position[0], estimate.mean[1] - now.position[1]
-        diverged = dx * dx + dy * dy > limits.position_error * limits.position_error
-        status = (
-            info.status | jnp.where(finite, 0, int(Status.NON_FINITE)) | jnp.where(diverged, int(Status.DIVERGED), 0)
-        )
+        status = info.status | jnp.where(finite, 0, int(Status.NON_FINITE))
+        if limits.position_error is not None:
+            dx, dy = estimate.mean[0] - now.position[0], estimate.mean[1] - now.position[1]
+            far = dx * dx + dy * dy > limits.position_error * limits.position_error
+            status = status | jnp.where(far, lost_bit, 0)
         failed = jnp.where((failed < 0) & ((status & int(FAILURE)) != 0), k, failed)
-        out = jnp.where(finite, row, 0.0), report(estimate, info, status, rules.full)
+        out = jnp.where(finite, row, 0.0), counts_of(estimate, now, info), report(estimate, info, status, rules.full)
         return (state, seen | status, failed), out
 
     steps = jnp.arange(dt.shape[0])
     start = tracker.flt.init(tracker.prior, start_key(key))
     carry = (start, jnp.asarray(0), jnp.asarray(-1, steps.dtype))
-    (state, status, failed), (rows, track) = jax.lax.scan(step, carry, (steps, scans, dt, truth))
+    (state, status, failed), (rows, counts, track) = jax.lax.scan(step, carry, (steps, scans, dt, truth))
+    last, last_truth = tracker.flt.estimate(state), jax.tree.map(lambda leaf: leaf[-1], truth)
+    lost = jnp.asarray(False)
     if limits.final_iou is not None:
-        lost = iou(tracker.flt.estimate(state), jax.tree.map(lambda leaf: leaf[-1], truth)) < limits.final_iou
-        status = status | jnp.where(lost, int(Status.DIVERGED), 0)
+        lost = iou(last, last_truth) < limits.final_iou
+    final = dict(zip((m.name for m in rules.metrics), rows[-rules.last_steps :].mean(axis=0), strict=True))
+    for name, bound in (limits.final_means or {}).items():
+        if name in final:  # a reference filter has no metrics
+            lost = lost | (final[name] > bound)
+    status = status | jnp.where(lost, lost_bit, 0)
+    if rules.exclude_lost:
         failed = jnp.where((failed < 0) & lost, steps[-1], failed)
-    means = rows[rules.first_step :].mean(axis=0)
-    is_rms = jnp.array([metric.over_time == "rms" for metric in rules.metrics], bool)
-    return Scores(jnp.where(is_rms, jnp.sqrt(means), means), rows, status, failed, track)
+    lost = (status & int(FAILURE | Status.LOST)) != 0
+    ending = Ending(last, last_truth, lost.astype(dt.dtype))
+    values = []
+    for k, metric in enumerate(rules.metrics):
+        used = rows[rules.first_step :, k]
+        if metric.at_end is not None:
+            values.append(metric.at_end(ending) if metric.applies_to(last) else jnp.zeros((), dt.dtype))
+        elif k in counts:
+            weight = counts[k][rules.first_step :]
+            values.append((weight * used).sum() / jnp.maximum(weight.sum(), 1.0))
+        else:
+            values.append(jnp.sqrt(used.mean()) if metric.over_time == "rms" else used.mean())
+    return Scores(jnp.stack(values) if values else jnp.zeros(0, dt.dtype), rows, status, failed, track)

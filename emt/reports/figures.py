@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from emt.reports.connected_art import connected_legend, draw_snapshots, is_connected, movie_of
 from emt.reports.ellipse_art import scene_of
 from emt.reports.plot_style import MANEUVER, fixed_look, legend_below, new_figure, plain, png, styles_of
 from emt.reports.series_art import (
@@ -50,8 +51,14 @@ def track_figure(
         A PNG.
     """
     with fixed_look():
-        scene = scene_of(arrays, labels, run_index)
         styles = styles_of(labels)
+        if is_connected(arrays):
+            figure = new_figure(9.6, 5.6)
+            draw_snapshots(figure, movie_of(arrays, labels, run_index), styles, length_unit, 2, 4)
+            legend_below(figure, *connected_legend(styles))
+            figure.suptitle(plain(title))
+            return png(figure)
+        scene = scene_of(arrays, labels, run_index)
         figure = new_figure(*track_size(scene))
         draw_track(figure, scene, styles, length_unit, {})
         legend_below(figure, *track_legend(scene, styles))
@@ -87,7 +94,8 @@ def over_time_figure(
     """
     with fixed_look():
         styles = styles_of(list(curves))
-        told = [m for m in metrics if any(m["name"] in c and c[m["name"]].mean.any() for c in curves.values())]
+        shown = [m for m in metrics if m["over_time"] != "end" and not m.get("counted")]
+        told = [m for m in shown if any(m["name"] in c and c[m["name"]].mean.any() for c in curves.values())]
         chosen = chosen_metrics(told, max_panels)  # nothing but zeros needs no panel
         rows, columns = grid(max(len(chosen), 1))
         figure = new_figure(7.2 if columns == 1 else 9.6, 0.9 + (2.1 if columns == 1 else 2.5) * rows)
@@ -153,12 +161,18 @@ def replay_figure(
         A PNG.
     """
     with fixed_look():
-        scene, styles = scene_of(arrays, labels, run_index), styles_of(labels)
+        styles = styles_of(labels)
         series = run_series(arrays, labels, metrics, run_index, length_unit, max_panels)
         failures = {label: failures_of(arrays, label, run_index) for label in labels}
         figure = new_figure(12.0, 6.6)
         left, right = np.ravel(figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1.0)))
-        draw_track(left, scene, styles, length_unit, failures)
+        if is_connected(arrays):
+            draw_snapshots(left, movie_of(arrays, labels, run_index), styles, length_unit, 3, 2)
+            legend = connected_legend(styles)
+        else:
+            scene = scene_of(arrays, labels, run_index)
+            draw_track(left, scene, styles, length_unit, failures)
+            legend = track_legend(scene, styles)
         panels: list[Axes] = list(right.subplots(len(series), 1, squeeze=False, sharex=True).ravel())
         for ax, panel in zip(panels, series, strict=True):
             draw_run(ax, panel, failures, styles)
@@ -167,7 +181,7 @@ def replay_figure(
         if notes:
             shown = notes[:3] + [f"and {len(notes) - 3} more"] * (len(notes) > 3)
             right.suptitle(plain("× failed – " + "\n".join(shown)), fontsize=8.5, color="#A00000")
-        legend_below(figure, *track_legend(scene, styles))
+        legend_below(figure, *legend)
         if title:
             figure.suptitle(plain(title))
         return png(figure)

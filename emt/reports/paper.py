@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from emt.config.shipped import published_path
+from emt.reports.claims import claims_table
 from emt.reports.estimates import estimates_table
-from emt.reports.published import LEGEND, Published, claims_table, comparison_table, load_published, summary_table
+from emt.reports.published import LEGEND, Published, comparison_table, load_published, median_table, summary_table
 from emt.reports.summary import SUMMARY_FILE
 from emt.reports.table import Table
 from emt.store import RunReader, StoreError, read_folder
 
-FIGURES = ("track.png", "over_time.png")
+FIGURES = ("track.png", "over_time.png", "animation.gif")
 FRAMES = (1, 2, 11, 20, 50, 80, 105)
 """Frames of a recording that a report shows."""
 
@@ -29,7 +30,8 @@ class PaperReport(NamedTuple):
         """The report as Markdown; figures are referred to by `prefix` and their names."""
         lines = [f"# {self.paper}", ""]
         if self.published is not None:
-            lines += [self.published.citation, "", *[f"- {line}" for line in LEGEND], ""]
+            legend = LEGEND if self.published.tables else LEGEND[-1:]
+            lines += [self.published.citation, "", *[f"- {line}" for line in legend], ""]
             lines += [f"- `{name}`: {text}" for name, text in self.published.definitions.items()] + [""]
         lines += [part.render("markdown") for part in self.tables]
         lines += [f"![{name}]({prefix}{name})\n" for name in self.figures]
@@ -75,7 +77,9 @@ def experiment_tables(reader: RunReader, published: Published | None) -> list[Ta
         for part in (published.tables if published else ())
         if part.experiment == summary["experiment"]
     ]
-    return [*tables, summary_table(summary, unit)]
+    tables.append(summary_table(summary, unit))
+    rule = manifest["identity"]["config"]["divergence"]
+    return tables if rule is None or rule["exclude"] else [*tables, median_table(summary, unit)]
 
 
 def folder_tables(folder: Path) -> list[Table]:
@@ -91,14 +95,14 @@ def folder_tables(folder: Path) -> list[Table]:
 def paper_report(paper: str, folders: Mapping[str, Path]) -> PaperReport:
     """The report over the run folders of a paper's experiments, by experiment name."""
     published = published_of(paper)
-    tables, figures, summaries = [], {}, {}
+    tables, figures, summaries, readers = [], {}, {}, {}
     for name, folder in folders.items():
         reader = read_folder(folder)
         tables += experiment_tables(reader, published)
         if reader.manifest["metrics"]:
-            summaries[name] = read_summary(reader)
+            summaries[name], readers[name] = read_summary(reader), reader
         short = name.split("/")[-1]
         figures |= {f"{short}-{figure}": folder / figure for figure in FIGURES if (folder / figure).is_file()}
     if published and published.claims:
-        tables.append(claims_table(published.claims, summaries))
+        tables.append(claims_table(published.claims, summaries, readers))
     return PaperReport(paper, published, tables, figures)

@@ -1,15 +1,15 @@
 """Published numbers beside ours: verdicts from our interval and the printed precision."""
 
-import itertools
 import math
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 
 from emt.config.errors import validate
 from emt.config.source import load_source
-from emt.reports.numbers import unit_text, value_and_error
+from emt.reports.claims import Claim
+from emt.reports.numbers import significant, unit_text, value_and_error
 from emt.reports.table import Column, Table
 from emt.settings import Settings
 
@@ -44,22 +44,13 @@ class PublishedTable(Settings):
     cells: tuple[Cell, ...]
 
 
-class Claim(Settings):
-    """An ordering that the paper states in words: values increase in this order of the filters."""
-
-    text: str
-    experiment: str
-    metric: str
-    order: tuple[str, ...]
-
-
 class Published(Settings):
     """All numbers and claims of a paper that can be compared."""
 
     paper: str
     citation: str
-    definitions: dict[str, str]
-    tables: tuple[PublishedTable, ...]
+    definitions: dict[str, str] = Field(default_factory=dict)
+    tables: tuple[PublishedTable, ...] = ()
     claims: tuple[Claim, ...] = ()
 
 
@@ -168,39 +159,6 @@ def comparison_table(table: PublishedTable, summary: dict[str, Any], length_unit
     return Table(f"{table.title} ({table.runs} runs in the paper)", columns, rows, values)
 
 
-def claim_verdict(claim: Claim, summary: dict[str, Any]) -> tuple[str, str]:
-    """(verdict, our numbers) for an ordering claimed in words.
-
-    "holds" if each step of the order exceeds 1.96 standard errors of the difference, taken as independent (the
-    filters share their scans, so this is cautious); "undecided" within it; "does not hold" beyond it on the other side.
-    """
-    ours = [summary["filters"].get(label, {}).get(claim.metric) for label in claim.order]
-    if any(o is None or o["value"] is None for o in ours):
-        return "not comparable", ""
-    numbers = " < ".join(value_and_error(o["value"], o["se"])[0] for o in ours)
-    verdict = "holds"
-    for low, high in itertools.pairwise(ours):
-        gap, error = high["value"] - low["value"], 1.96 * math.hypot(low["se"] or 0.0, high["se"] or 0.0)
-        if gap < -error:
-            return "does not hold", numbers.replace("<", "/")
-        if gap <= error:
-            verdict = "undecided"
-    return verdict, numbers if verdict == "holds" else numbers.replace("<", "/")
-
-
-def claims_table(claims: tuple[Claim, ...], summaries: dict[str, dict[str, Any]]) -> Table:
-    """Every claim with its verdict, for the experiments at hand."""
-    columns = [Column("claim", "claim"), Column("numbers", "ours", True), Column("verdict", "verdict")]
-    rows, values = [], []
-    for claim in claims:
-        if claim.experiment not in summaries:
-            continue
-        verdict, numbers = claim_verdict(claim, summaries[claim.experiment])
-        rows.append({"claim": claim.text, "numbers": numbers, "verdict": verdict})
-        values.append({"experiment": claim.experiment, "metric": claim.metric, "claim": claim.text, "verdict": verdict})
-    return Table("Claims in the paper's text", columns, rows, values)
-
-
 def summary_table(summary: dict[str, Any], length_unit: str) -> Table:
     """All metrics of all filters of one experiment: filters down, metrics across."""
     metrics = [m for m in summary["metrics"] if m["over_runs"] != "std"]
@@ -222,3 +180,21 @@ def summary_table(summary: dict[str, Any], length_unit: str) -> Table:
         for name, ours in numbers.items():
             values.append({"experiment": summary["experiment"], "filter": label, "metric": name, **ours})
     return Table(f"{summary['experiment']}, {summary['runs']} runs, seed {summary['seed']}", columns, rows, values)
+
+
+def median_table(summary: dict[str, Any], length_unit: str) -> Table:
+    """Medians over runs of all metrics of one experiment, for experiments that keep lost runs in the averages."""
+    metrics = [m for m in summary["metrics"] if m["over_runs"] == "mean" and m["over_time"] != "end"]
+    columns = [Column("filter", "filter")]
+    columns += [Column(m["name"], f"{m['name']} {unit_text(m['unit'], length_unit)}".strip(), True) for m in metrics]
+    rows, values = [], []
+    for label in summary["labels"]:
+        numbers, row = summary["filters"][label], {"filter": label}
+        for metric in (m for m in metrics if m["name"] in numbers):
+            median = numbers[metric["name"]]["median"]
+            row[metric["name"]] = "" if median is None else significant(median, 3)
+            values.append(
+                {"experiment": summary["experiment"], "filter": label, "metric": metric["name"], "median": median}
+            )
+        rows.append(row)
+    return Table(f"{summary['experiment']}, medians over {summary['runs']} runs", columns, rows, values)

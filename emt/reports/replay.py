@@ -11,8 +11,12 @@ from emt.status import Status
 Arrays = dict[str, np.ndarray]
 
 
-def steps_table(arrays: Arrays, labels: list[str], metrics: list[dict[str, Any]]) -> Table:
-    """One row per filter and step of the first run in the arrays; metrics that are averaged as squares stay squared."""
+def steps_table(arrays: Arrays, labels: list[str], metrics: list[dict[str, Any]], state: list[str]) -> Table:
+    """One row per filter and step of the first run in the arrays; metrics that are averaged as squares stay squared.
+
+    Args:
+        state: names of the entries of the filters' means.
+    """
     rows = []
     for label in labels:
         track = {
@@ -20,9 +24,11 @@ def steps_table(arrays: Arrays, labels: list[str], metrics: list[dict[str, Any]]
         }
         for k in range(len(track["mean"])):
             row: dict[str, Any] = {"filter": label, "scan": k + 1}
-            row |= dict(zip(("x", "y", "vx", "vy"), map(float, track["mean"][k]), strict=True))
-            row |= {"semi_axis_1": float(track["semi_axes"][k, 0]), "semi_axis_2": float(track["semi_axes"][k, 1])}
-            row |= {"orientation": float(track["orientation"][k]), "nis": float(track["nis"][k])}
+            row |= dict(zip(state, map(float, track["mean"][k]), strict=True))
+            if "semi_axes" in track:
+                row |= {"semi_axis_1": float(track["semi_axes"][k, 0]), "semi_axis_2": float(track["semi_axes"][k, 1])}
+                row["orientation"] = float(track["orientation"][k])
+            row["nis"] = float(track["nis"][k])
             for column, metric in enumerate(metrics):
                 if label in metric["without"]:
                     continue

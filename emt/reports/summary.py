@@ -93,6 +93,27 @@ def rms_over_runs(results: FilterResults, column: int, first_step: int) -> tuple
     return value, float(np.sqrt((blocks - 1) / blocks * np.sum((without - without.mean()) ** 2)))
 
 
+def window_ratio(
+    results: FilterResults, column: int, window: tuple[int, int], against: tuple[int, int]
+) -> tuple[float, float]:
+    """Mean of a metric over the scans of one window over that of another, with a standard error by the jackknife.
+
+    Args:
+        window, against: first and last scan, counted from 1.
+    """
+
+    def sums(bounds: tuple[int, int]) -> np.ndarray:
+        return results.step_sum[:, bounds[0] - 1 : bounds[1], column].mean(axis=1)
+
+    above, below = sums(window), sums(against)
+    ratio = float(above.sum() / below.sum())
+    n = len(above)
+    if n < 2:
+        return ratio, math.nan
+    without = (above.sum() - above) / (below.sum() - below)
+    return ratio, float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+
+
 def summarise_metric(metric: dict[str, Any], results: FilterResults, column: int, first_step: int) -> dict[str, Any]:
     """value, se, std, median and runs_used of one metric; None where the runs do not allow a number."""
     values = results.values[results.sound, column]

@@ -1,5 +1,23 @@
 """Imports every scenario of this package, which registers it under its kind."""
 
-from emt.scenarios import annotated, constant_velocity, coordinated_turns, course, recorded, stationary, trajectory
+from emt.scenarios import (
+    annotated,
+    connected,
+    constant_velocity,
+    coordinated_turns,
+    course,
+    recorded,
+    stationary,
+    trajectory,
+)
 
-__all__ = ["annotated", "constant_velocity", "coordinated_turns", "course", "recorded", "stationary", "trajectory"]
+__all__ = [
+    "annotated",
+    "connected",
+    "constant_velocity",
+    "coordinated_turns",
+    "course",
+    "recorded",
+    "stationary",
+    "trajectory",
+]

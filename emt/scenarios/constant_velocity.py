@@ -98,7 +98,7 @@ def build(settings: ConstantVelocitySettings, runs: int):
 
             _, states = jax.lax.scan(step, params.start, jnp.arange(n_steps))
             axes = jnp.broadcast_to(params.semi_axes, (n_steps, 2))
-            return Truth(states[:, :2], states[:, 2:4], Ellipse(axes, states[:, 4]))
+            return Truth(states[:, :4], Ellipse(axes, states[:, 4]))
 
         return Scenario(jnp.full(n_steps, params.dt), sample_truth, scans)
 

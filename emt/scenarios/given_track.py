@@ -47,7 +47,7 @@ def given_track(detections: DetectionSettings, runs: int, dt: float, position, v
             return sample_scans(key, truth, detections, params.detections, capacity)
 
         def sample_truth(key) -> Truth:
-            return Truth(params.position, params.velocity, Ellipse(params.semi_axes, params.orientation))
+            return Truth.moving(params.position, params.velocity, Ellipse(params.semi_axes, params.orientation))
 
         return Scenario(jnp.full(n_steps, params.dt), sample_truth, scans)
 

@@ -132,7 +132,7 @@ def build(settings: RecordedSettings, runs: int):
         def no_truth(key) -> Truth:
             # there is none: experiments on recordings have no metric that would look at it
             zero = jnp.zeros((n_steps, 2), params.points.dtype)
-            return Truth(zero, zero, Ellipse(zero + 1.0, zero[:, 0]))
+            return Truth.moving(zero, zero, Ellipse(zero + 1.0, zero[:, 0]))
 
         def scans(truth, key):
             return Measurements(params.points, params.mask, jnp.zeros(n_steps, bool))

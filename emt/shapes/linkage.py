@@ -6,7 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from emt.linalg import Mat2, Vec2
+from emt.linalg import Vec2
+from emt.trigonometry import sincos
 from emt.types import Scalar
 
 
@@ -30,11 +31,19 @@ class Segment(NamedTuple):
     direction: Scalar
     """Angle against the x axis (rad)."""
     length: Scalar
+    cos: Scalar
+    """Of the direction."""
+    sin: Scalar
 
     def at(self, share: Scalar) -> Vec2:
         """The point at this share of the length from the start."""
         reach = share * self.length
-        return Vec2(self.start.x + reach * jnp.cos(self.direction), self.start.y + reach * jnp.sin(self.direction))
+        return Vec2(self.start.x + reach * self.cos, self.start.y + reach * self.sin)
+
+    def local(self, point: Vec2) -> Vec2:
+        """A point in the frame of the link: along it, and to its left."""
+        x, y = point.x - self.start.x, point.y - self.start.y
+        return Vec2(self.cos * x + self.sin * y, self.cos * y - self.sin * x)
 
 
 def place(links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2) -> list[Segment]:
@@ -45,7 +54,9 @@ def place(links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2) ->
         turned = sum((factor * parameters[k] for k, factor in link.angle), jnp.asarray(link.offset, parameters.dtype))
         length = parameters[link.length] if isinstance(link.length, int) else jnp.asarray(link.length, parameters.dtype)
         start = origin if parent is None else parent.at(jnp.ones_like(length))
-        placed.append(Segment(start, turned if parent is None else parent.direction + turned, length))
+        direction = turned if parent is None else parent.direction + turned
+        sin, cos = sincos(direction)
+        placed.append(Segment(start, direction, length, cos, sin))
     return placed
 
 
@@ -54,16 +65,19 @@ def segment_residual(segment: Segment, share: Scalar, point: Vec2) -> Vec2:
 
     The map from point to residual is a rigid motion, so densities of h are densities per area.
     """
-    local = Mat2.rotation(segment.direction).T @ (point - segment.start)
+    local = segment.local(point)
     return Vec2(segment.length * share - local.x, -local.y)
 
 
-def disc_residual_moments(radius: Scalar, center: Vec2, noise_variance: Scalar, point: Vec2) -> tuple[Scalar, Scalar]:
+def disc_residual_moments(
+    radius: Scalar, center: Vec2, noise_variance: Scalar, point: Vec2, cross_term: bool = True
+) -> tuple[Scalar, Scalar]:
     """Mean and variance of h = |y - b|² - r² s² - v̄ for a point of a filled disc under isotropic noise (m², m⁴).
 
     With s² uniform on (0, 1), v̄ = |v|² + 2 z·v about the source z: mean r²/2 + 2σ², variance r⁴/12 + 4σ⁴ + 2σ² r². The
-    cross term 2 z·v is missing in Zea, Faion and Hanebeck 2014.
+    cross term 2 z·v, with the last of these, is missing in Zea, Faion and Hanebeck 2014.
     """
     d = point - center
     mean = d.x * d.x + d.y * d.y - 0.5 * radius**2 - 2.0 * noise_variance
-    return mean, radius**4 / 12.0 + 4.0 * noise_variance**2 + 2.0 * noise_variance * radius**2
+    variance = radius**4 / 12.0 + 4.0 * noise_variance**2
+    return mean, variance + 2.0 * noise_variance * radius**2 if cross_term else variance

@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from emt.config.experiment import Experiment
-from emt.filters.base import TrackingModel
-from emt.montecarlo.program import cast, model_of, prior_of
+from emt.montecarlo.program import cast
+from emt.montecarlo.world import model_of, prior_of
 from emt.registry import FILTERS
-from emt.types import Prior
+from emt.types import Prior, StatePrior
 
 
 class Trial(NamedTuple):
     """What one filter is told and set to."""
 
-    model: TrackingModel
-    prior: Prior
+    model: Any
+    prior: Prior | StatePrior
     params: Any
 
 
@@ -37,7 +37,7 @@ def build_trial(experiment: Experiment, label: str) -> Built:
     """The trial of a checked experiment."""
     settings = experiment.filters[label]
     params, make = FILTERS.get(settings.kind).builder(settings)
-    trial = Trial(model_of(experiment.model), prior_of(experiment.model.prior), params)
+    trial = Trial(model_of(experiment.model), prior_of(experiment.model), params)
     trial = cast(trial, jnp.dtype(experiment.monte_carlo.dtype))
     dump = [settings.model_dump(mode="json"), experiment.model.model_dump(mode="json")]
     shapes = str(jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), trial))

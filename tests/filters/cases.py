@@ -430,5 +430,5 @@ CASES = [
 MAIN = [case for case in CASES if case.label in ("vb_random_matrix", "mem_ekf_star", "feldmann", "gp_ett")]
 """One row per filter."""
 
-ELSEWHERE = {"sampled_posterior", "moment_ukf", "lan_li", "imm"}
+ELSEWHERE = {"sampled_posterior", "moment_ukf", "lan_li", "imm", "shape_mixture"}
 """Filters with files of tests of their own."""

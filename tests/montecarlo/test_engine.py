@@ -1,7 +1,6 @@
 """A run is the same alone, in any chunk, in any company."""
 
 from copy import copy
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +12,6 @@ import pytest
 from emt.config.load import load_experiment
 from emt.montecarlo.chunks import Engine, chunk_runs
 from emt.montecarlo.program import Program
-from emt.montecarlo.run import Limits
 from emt.status import FAILURE, Status
 from tests.montecarlo.small import TEXT, write
 
@@ -94,9 +92,7 @@ def test_sums_per_step_are_those_of_the_tracks():
 
 
 def test_divergence_takes_a_run_out_and_says_when():
-    strict, program = copy(engine()), engine().program
-    strict.program = replace(program, world=program.world._replace(limits=Limits(jnp.asarray(1.5), None)))
-    arrays = strict.run_chunk(0, 16, tracks=True)
+    arrays = engine("divergence={position_error_above: 1.5}").run_chunk(0, 16, tracks=True)
     lost = (arrays["feldmann/status"] & Status.DIVERGED) != 0
     assert 0 < lost.sum() < 16
     track, truth = arrays["feldmann/track/mean"][..., :2], arrays["truth/position"]

@@ -34,7 +34,7 @@ def settings_of(count, source="uniform", noise=NOISE, max_points=None) -> Detect
 def truth() -> Truth:
     centre = jnp.broadcast_to(jnp.asarray(CENTRE), (STEPS, 2))
     ellipse = Ellipse(jnp.broadcast_to(jnp.asarray(AXES), (STEPS, 2)), jnp.full(STEPS, ANGLE))
-    return Truth(centre, jnp.zeros((STEPS, 2)), ellipse)
+    return Truth.moving(centre, jnp.zeros((STEPS, 2)), ellipse)
 
 
 @cache

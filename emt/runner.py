@@ -185,7 +185,7 @@ def run(
         tell("reporting", "tables and figures", done)
         if not first_run and not (folder.path / TRACK_FIGURE).exists():
             engine.compile()
-            first_run = engine.run_chunk(0, 1, tracks=True)
+            first_run = engine.run_chunk(0, 1, tracked=1)
         summary = write_reports(folder, first_run)
         if timing:
             folder.write_json("timing.json", timing)
@@ -237,7 +237,10 @@ def replay(loaded: Loaded, run: int) -> Replay:
     engine = Engine(program, loaded.experiment.monte_carlo.seed, loaded.experiment.chunk_size)
     engine.compile()
     start = run - run % engine.chunk_size  # the chunk the run would belong to, so that the same lanes compute it
-    arrays = {name: values[run - start :] for name, values in engine.run_chunk(start, run + 1, tracks=True).items()}
+    arrays = {
+        name: values[run - start :]
+        for name, values in engine.run_chunk(start, run + 1, tracked=run + 1 - start).items()
+    }
     metrics = metric_facts(program)
     labels, unit = list(loaded.experiment.filters), loaded.experiment.length_unit
     title = f"{loaded.experiment.title or loaded.name}: run {run}"

@@ -78,14 +78,14 @@ def check(
     import json
 
     from emt.cli.running import run_shown
-    from emt.config.load import load_experiment
+    from emt.config.load import at_smoke_scale, load_experiment
     from emt.config.shipped import SHIPPED, config_names
     from emt.device import environment
     from emt.reports.baseline import BaselineError, baseline_of, changes_table, compare, read_baseline
 
     if baselines is None:
         baselines = SHIPPED / "results" / "baselines"
-    loaded = [load_experiment(name) for name in names or config_names()]
+    loaded = [at_smoke_scale(load_experiment(name)) for name in names or config_names()]
     loaded = [item for item in loaded if item.experiment.scenario.kind != "recorded"]  # these need the user's file
     paths = {item.name: baselines / f"{item.name}.json" for item in loaded}
     try:
@@ -95,7 +95,7 @@ def check(
     changes = []
     with tempfile.TemporaryDirectory() as scratch:
         for item in loaded:
-            summary = run_shown(item, Path(scratch) / item.name, runs=item.experiment.monte_carlo.smoke_runs)
+            summary = run_shown(item, Path(scratch) / item.name)
             now = baseline_of(summary, environment())
             if update:
                 path = paths[item.name]

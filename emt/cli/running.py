@@ -108,7 +108,7 @@ def reproduce(
 
     Example: emt reproduce tuncer2021 --scale smoke
     """
-    from emt.config.load import load_experiment
+    from emt.config.load import at_smoke_scale, load_experiment
     from emt.config.shipped import config_names
     from emt.config.shipped import papers as shipped_papers
     from emt.registry import suggest
@@ -131,9 +131,8 @@ def reproduce(
                     say(f"{item.name}: skipped, it needs its recording: --data PATH")
                     continue
                 item = load_experiment(item.name, [f"scenario.path={recordings[item.name]}"])
-            runs = item.experiment.monte_carlo.smoke_runs if scale == Scale.smoke else None
             folders[item.name] = out / item.name
-            run_shown(item, folders[item.name], runs=runs)
+            run_shown(at_smoke_scale(item) if scale == Scale.smoke else item, folders[item.name])
         report = paper_report(paper, folders)
         for part in report.tables:
             typer.echo(part.render("text"))

@@ -86,6 +86,19 @@ def load_experiment(text: str, overrides: Iterable[str] = ()) -> Loaded:
     return Loaded(experiment_name(path, experiment), experiment, source)
 
 
+def at_smoke_scale(loaded: Loaded) -> Loaded:
+    """The experiment at the reduced scale of regression checks.
+
+    Raises:
+        ConfigError: its `smoke_settings` cannot be used.
+    """
+    settings = loaded.experiment.monte_carlo.smoke_settings
+    runs = loaded.experiment.monte_carlo.smoke_runs
+    texts = [f"monte_carlo.runs={runs}", *(f"{key}={value}" for key, value in settings.items())]
+    source = apply_overrides(loaded.source, texts)
+    return Loaded(loaded.name, check(source, Path(loaded.source.path)), source)
+
+
 def check(source: Source, path: Path) -> Experiment:
     """The experiment that a source describes.
 

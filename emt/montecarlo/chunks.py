@@ -96,23 +96,27 @@ class Engine:
         with ThreadPoolExecutor(WORKERS) as pool:
             self._compiled = dict(zip(names, pool.map(build, names), strict=True))
 
-    def run_chunk(self, start: int, stop: int, *, tracks: bool = False) -> dict[str, np.ndarray]:
-        """Arrays of the runs `start` to `stop - 1`, by name; with every report and scan if asked for."""
+    def run_chunk(self, start: int, stop: int, *, tracked: int = 0) -> dict[str, np.ndarray]:
+        """Arrays of the runs `start` to `stop - 1`, by name; with every report and scan of the first `tracked` runs.
+
+        An experiment that asks for traces gets those of all runs.
+        """
         program, n = self.program, stop - start
         experiment, world = program.experiment, program.world
         runs = jnp.asarray(chunk_runs(start, stop, self.chunk_size))
         simulation = self._compiled[""](world, self.seed, runs)
         target, arrays = simulation.truth, {}
+        tracked = n if experiment.traces else min(tracked, n)
         for label in self.labels():
             params = program.filter_params[label]
             scores = self._compiled[label](world, params, self.seed, runs, simulation.scans, target)
             if label == experiment.reference:
                 target = jax.vmap(as_truth)(scores.track)
             arrays |= score_arrays(label, scores, n)
-            if tracks or experiment.traces:
-                arrays |= track_arrays(label, scores, n)
-        if tracks or experiment.traces:
-            arrays |= scan_arrays(simulation, experiment.scenario.has_truth, n)
+            if tracked:
+                arrays |= track_arrays(label, scores, tracked)
+        if tracked:
+            arrays |= scan_arrays(simulation, experiment.scenario.has_truth, tracked)
         return arrays
 
     def run_chunks(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
@@ -124,7 +128,7 @@ class Engine:
             waiting: deque = deque()
             try:
                 for start, stop in ranges:
-                    waiting.append((start, stop, pool.submit(self.run_chunk, start, stop, tracks=start == 0)))
+                    waiting.append((start, stop, pool.submit(self.run_chunk, start, stop, tracked=int(start == 0))))
                     if len(waiting) > WORKERS:
                         first, last, future = waiting.popleft()
                         yield first, last, future.result()

@@ -27,6 +27,9 @@ from emt.reports.series_art import (
 from emt.reports.summary import Curve
 from emt.reports.track_art import draw_track, track_legend, track_size
 
+LONG, SMOOTHED_SCANS = 2000, 51
+"""Longer runs than this many scans are shown as moving averages over so many."""
+
 __all__ = ["over_time_figure", "png", "replay_figure", "track_figure"]
 
 
@@ -94,8 +97,10 @@ def over_time_figure(
     """
     with fixed_look():
         styles = styles_of(list(curves))
-        shown = [m for m in metrics if m["over_time"] != "end" and not m.get("counted")]
-        told = [m for m in shown if any(m["name"] in c and c[m["name"]].mean.any() for c in curves.values())]
+        n_steps = max((len(curve.mean) for c in curves.values() for curve in c.values()), default=0)
+        width = SMOOTHED_SCANS if n_steps >= LONG else 1
+        curves = {label: {name: smoothed(c, width) for name, c in named.items()} for label, named in curves.items()}
+        told = [m for m in metrics if any(m["name"] in c and c[m["name"]].mean.any() for c in curves.values())]
         chosen = chosen_metrics(told, max_panels)  # nothing but zeros needs no panel
         rows, columns = grid(max(len(chosen), 1))
         figure = new_figure(7.2 if columns == 1 else 9.6, 0.9 + (2.1 if columns == 1 else 2.5) * rows)
@@ -127,7 +132,7 @@ def over_time_figure(
             handles.append(Patch(color=MANEUVER))
             names.append("true manoeuvre")
         legend_below(figure, handles, names)
-        counted = _count_text(list(runs.values()))
+        counted = _count_text(list(runs.values())) + (f"; averaged over {width} {dt_label}s" if width > 1 else "")
         figure.suptitle(plain(f"{title} – {counted}" if title else counted))
         return png(figure)
 
@@ -185,6 +190,16 @@ def replay_figure(
         if title:
             figure.suptitle(plain(title))
         return png(figure)
+
+
+def smoothed(curve: Curve, width: int) -> Curve:
+    """Moving averages of mean and spread; shorter ones at the ends."""
+    if width == 1:
+        return curve
+    kernel = np.ones(width)
+    count = np.convolve(np.ones(len(curve.mean)), kernel, "same")
+    mean, std = (np.convolve(values, kernel, "same") / count for values in (curve.mean, curve.std))
+    return Curve(mean, std, curve.runs)
 
 
 def _count_text(runs: Sequence[int]) -> str:

@@ -12,7 +12,8 @@ from emt.reports.summary import SUMMARY_FILE
 from emt.reports.table import Table
 from emt.store import RunReader, StoreError, read_folder
 
-FIGURES = ("track.png", "over_time.png", "animation.gif")
+FIGURES = ("track.png", "over_time.png")
+ANIMATION = "animation.gif"
 FRAMES = (1, 2, 11, 20, 50, 80, 105)
 """Frames of a recording that a report shows."""
 
@@ -102,7 +103,8 @@ def paper_report(paper: str, folders: Mapping[str, Path]) -> PaperReport:
         if reader.manifest["metrics"]:
             summaries[name], readers[name] = read_summary(reader), reader
         short = name.split("/")[-1]
-        figures |= {f"{short}-{figure}": folder / figure for figure in FIGURES if (folder / figure).is_file()}
+        wanted = (*FIGURES, ANIMATION) if published and name in published.animations else FIGURES
+        figures |= {f"{short}-{figure}": folder / figure for figure in wanted if (folder / figure).is_file()}
     if published and published.claims:
         tables.append(claims_table(published.claims, summaries, readers))
     return PaperReport(paper, published, tables, figures)

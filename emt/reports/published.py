@@ -52,6 +52,8 @@ class Published(Settings):
     definitions: dict[str, str] = Field(default_factory=dict)
     tables: tuple[PublishedTable, ...] = ()
     claims: tuple[Claim, ...] = ()
+    animations: tuple[str, ...] = ()
+    """Experiments whose animation belongs in the report."""
 
 
 class Comparison(NamedTuple):

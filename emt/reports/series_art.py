@@ -30,7 +30,7 @@ Z95 = 1.96
 
 def chosen_metrics(metrics: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
     """The metrics worth a panel: at most so many, the telling ones first; none that is a spread over runs."""
-    usable = [metric for metric in metrics if metric["over_runs"] != "std"]
+    usable = [m for m in metrics if m["over_runs"] != "std" and m["over_time"] != "end" and not m.get("counted")]
     rank = {name: place for place, name in enumerate(PREFERRED)}
     return sorted(usable, key=lambda metric: rank.get(metric["name"], len(rank)))[:most]
 
@@ -175,7 +175,9 @@ def run_series(
     """
     track = {
         label: {
-            name: np.asarray(arrays[f"{label}/track/{name}"][run], float) for name in ("per_step", "semi_axes", "nis")
+            name: np.asarray(arrays[f"{label}/track/{name}"][run], float)
+            for name in ("per_step", "semi_axes", "nis")
+            if f"{label}/track/{name}" in arrays
         }
         for label in labels
     }
@@ -190,6 +192,8 @@ def run_series(
             # in one run there is no mean to take the root of
             name = readable(metric).removeprefix("RMS ")
             panels.append(Series(name, unit_text(metric["unit"], length_unit), values))
+    if not panels and not all("semi_axes" in track[label] for label in labels):
+        panels = [Series("normalised innovation squared", "", {label: track[label]["nis"] for label in labels})]
     if not panels:
         axes = {label: np.sort(track[label]["semi_axes"], axis=1) for label in labels}
         panels = [

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float, Int
 from pydantic import Field, PositiveInt, model_validator
 
 from emt.keys import step_key
-from emt.linalg import cholesky
+from emt.linalg import Mat2
 from emt.models.switching import SwitchingSettings
 from emt.registry import SCENARIOS
+from emt.scenarios.detections import noise_root
 from emt.settings import Angle, Duration, Fraction, Length, NoiseCovariance, PositiveLength, Settings, TurnRate
 from emt.shapes.articulated import sources
 from emt.shapes.connected import Connected, ConnectedSettings, Name, connected, parameter_faults, probability_faults
@@ -91,7 +92,7 @@ class Params:
     """True lengths at their places in the state, 0 elsewhere."""
     swings: Float[Array, "n_angles 4"]
     """Centre, amplitude, rate and phase of every angle."""
-    noise_cov: Float[Array, "2 2"]
+    noise_root: Mat2
     probabilities: Float[Array, "c"]
     transition: Float[Array, "c c"] | None
     clutter: Float[Array, "5"] | None
@@ -140,7 +141,7 @@ def build(settings: ConnectedScenarioSettings, runs: int):
         settings.dt,
         jnp.array([settings.lengths.get(name, 0.0) for name in plan.state]),
         jnp.array([[a.center, a.amplitude, a.rate, a.phase] for a in angles]).reshape(-1, 4),
-        jnp.array(settings.noise_cov),
+        noise_root(settings.noise_cov),
         jnp.array([chosen[name] if chosen else 1.0 / n_parts for name in names]),
         jnp.array(settings.markov.matrix(n_parts)) if settings.markov else None,
         jnp.array([clutter.probability, *clutter.low, *clutter.high]) if clutter else None,
@@ -160,12 +161,13 @@ def build(settings: ConnectedScenarioSettings, runs: int):
             source = components_of(u[..., 0], params)
             seen = jax.vmap(jax.vmap(lambda s, v: sources(plan, s, v), in_axes=(None, 0)))(truth.state, u[..., 1:4])
             seen = jnp.take_along_axis(seen, source[..., None, None], axis=2)[:, :, 0]
-            root = cholesky(params.noise_cov + jnp.finfo(dtype).tiny * jnp.eye(2, dtype=dtype))
-            seen = seen + (noise[..., None, :] * root).sum(axis=-1)
+            root, (v, w) = params.noise_root, (noise[..., 0], noise[..., 1])
+            seen = seen + jnp.stack([root.xx * v, root.yx * v + root.yy * w], axis=-1)
             if params.clutter is not None:
                 low, high = params.clutter[1:3], params.clutter[3:5]
+                place = jnp.stack([low[k] + u[..., 1 + k] * (high[k] - low[k]) for k in range(2)], axis=-1)
                 is_clutter = u[..., 4] < params.clutter[0]
-                seen = jnp.where(is_clutter[..., None], low + u[..., 1:3] * (high - low), seen)
+                seen = jnp.where(is_clutter[..., None], place, seen)
                 source = jnp.where(is_clutter, CLUTTER, source)
             full = jnp.ones((n_steps, points), bool)
             return Measurements(seen, full, jnp.zeros(n_steps, bool), source)

@@ -14,6 +14,7 @@ from scipy.stats import poisson
 
 from emt.keys import step_key
 from emt.linalg import Mat2
+from emt.matrices import Matrix
 from emt.settings import NoiseCovariance, Settings
 from emt.types import Measurements, Scalar, Traced, Truth
 
@@ -74,13 +75,18 @@ def capacity_for(settings: DetectionSettings, n_steps: int, runs: int) -> int:
     return max(int(enough[0]), settings.count.minimum)
 
 
-def params_of(settings: DetectionSettings) -> DetectionParams:
-    """Traced numbers of the settings."""
-    (a, b), (_, d) = settings.noise_cov
+def noise_root(noise_cov: Matrix) -> Mat2:
+    """Lower triangular root of a covariance, which may be singular."""
+    (a, b), (_, d) = noise_cov
     l11 = math.sqrt(a)
     l21 = b / l11 if l11 > 0.0 else 0.0
+    return Mat2(l11, 0.0, l21, math.sqrt(max(d - l21 * l21, 0.0)))
+
+
+def params_of(settings: DetectionSettings) -> DetectionParams:
+    """Traced numbers of the settings."""
     mean = settings.count.mean if isinstance(settings.count, PoissonCount) else float(settings.count.count)
-    return DetectionParams(mean, Mat2(l11, 0.0, l21, math.sqrt(max(d - l21 * l21, 0.0))))
+    return DetectionParams(mean, noise_root(settings.noise_cov))
 
 
 def poisson_count(key: PRNGKeyArray, mean: Scalar, capacity: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:

@@ -145,9 +145,9 @@ def boundary_points(plan: Connected, parameters: Float[Array, "n"]) -> tuple[Flo
     links, points, weights = links_of(plan, parameters), [], []
     shares, count = jnp.asarray(SHARES, parameters.dtype), len(SHARES)
     for _, link in plan.segments:
-        at = links[link].at(shares)
-        points.append(jnp.stack([at.x, at.y], axis=1))
-        weights.append(jnp.broadcast_to(jnp.abs(links[link].length) / count, (count,)))
+        segment, reach = links[link], shares * links[link].length
+        points.append(jnp.stack([segment.start.x + reach * segment.cos, segment.start.y + reach * segment.sin], axis=1))
+        weights.append(jnp.broadcast_to(jnp.abs(segment.length) / count, (count,)))
     for body in plan.bodies:
         placed = body_at(body, links, parameters)
         a, b = jnp.abs(placed.semi_axes.x), jnp.abs(placed.semi_axes.y)

@@ -61,7 +61,7 @@ def test_one_more_filter_changes_no_other_filter():
 
 def test_one_more_padding_slot_changes_no_detection_and_no_result():
     padded = engine("scenario.detections.max_points=25")
-    ours, theirs = engine().run_chunk(0, 16, tracks=True), padded.run_chunk(0, 16, tracks=True)
+    ours, theirs = engine().run_chunk(0, 16, tracked=16), padded.run_chunk(0, 16, tracked=16)
     mask = ours["scans/mask"]
     np.testing.assert_array_equal(theirs["scans/mask"][..., :24], mask)
     assert not theirs["scans/mask"][..., 24].any()
@@ -82,7 +82,7 @@ def test_seeds_and_runs_differ():
 
 
 def test_sums_per_step_are_those_of_the_tracks():
-    arrays = engine().run_chunk(0, 13, tracks=True)
+    arrays = engine().run_chunk(0, 13, tracked=13)
     rows = arrays["feldmann/track/per_step"]
     np.testing.assert_allclose(arrays["feldmann/step_sum"].sum(axis=0), rows.sum(axis=0), rtol=1e-12)
     np.testing.assert_allclose(arrays["feldmann/step_squares"], (rows**2).sum(axis=0), rtol=1e-12)
@@ -92,7 +92,7 @@ def test_sums_per_step_are_those_of_the_tracks():
 
 
 def test_divergence_takes_a_run_out_and_says_when():
-    arrays = engine("divergence={position_error_above: 1.5}").run_chunk(0, 16, tracks=True)
+    arrays = engine("divergence={position_error_above: 1.5}").run_chunk(0, 16, tracked=16)
     lost = (arrays["feldmann/status"] & Status.DIVERGED) != 0
     assert 0 < lost.sum() < 16
     track, truth = arrays["feldmann/track/mean"][..., :2], arrays["truth/position"]
@@ -104,10 +104,10 @@ def test_divergence_takes_a_run_out_and_says_when():
 
 
 def test_steps_at_the_start_can_be_left_out_and_the_first_scan_preceded_by_a_prediction():
-    other = engine("skip_steps=2", "start_with=predict").run_chunk(0, 16, tracks=True)
+    other = engine("skip_steps=2", "start_with=predict").run_chunk(0, 16, tracked=16)
     rows = other["feldmann/track/per_step"]
     np.testing.assert_allclose(values(other)[:, 0], rows[:, 2:, 0].mean(axis=1), rtol=1e-12)
-    ours = engine().run_chunk(0, 16, tracks=True)["feldmann/track/per_step"]
+    ours = engine().run_chunk(0, 16, tracked=16)["feldmann/track/per_step"]
     assert not np.isclose(rows, ours, rtol=1e-6).all(axis=(1, 2)).any()
 
 
@@ -121,7 +121,7 @@ def test_single_precision_agrees_with_double():
 
 def test_a_reference_filter_takes_the_place_of_the_truth():
     text = TEXT.replace("metrics:", VB + "reference: vb\nmetrics:")
-    arrays = engine(text=text).run_chunk(0, 8, tracks=True)
+    arrays = engine(text=text).run_chunk(0, 8, tracked=8)
     assert arrays["vb/values"].shape == (8, 0)
     gap = arrays["feldmann/track/mean"][..., :2] - arrays["vb/track/center"]
     np.testing.assert_allclose(arrays["feldmann/track/per_step"][..., 2], (gap**2).sum(axis=-1), rtol=1e-9)

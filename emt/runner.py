@@ -128,6 +128,7 @@ def run(
     *,
     runs: int | None = None,
     more: int = 0,
+    figures: bool = True,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> dict[str, Any]:
     """Runs what is missing of an experiment and writes summary, tables and figures; returns the summary.
@@ -136,6 +137,7 @@ def run(
         out: the run folder; made if missing, continued if it belongs to the same configuration.
         runs: number of runs wanted in all; by default that of the configuration.
         more: number of runs to add to those in the folder, instead.
+        figures: whether figures are drawn beside the tables.
 
     Raises:
         ConfigError: the recording cannot be used.
@@ -183,37 +185,42 @@ def run(
             tell("running", f"chunk {number}/{len(missing)}", done, (done - present) / elapsed)
             timing["run_seconds"], timing["runs"] = elapsed, done - present
         tell("reporting", "tables and figures", done)
-        if not first_run and not (folder.path / TRACK_FIGURE).exists():
+        if figures and not first_run and not (folder.path / TRACK_FIGURE).exists():
             engine.compile()
             first_run = engine.run_chunk(0, 1, tracked=1)
-        summary = write_reports(folder, first_run)
+        summary = write_reports(folder)
+        if figures:
+            write_figures(folder, first_run)
         if timing:
             folder.write_json("timing.json", timing)
         tell("done", "", done)
     return summary
 
 
-def write_reports(folder: RunFolder, first_run: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Summary, table and figures of a run folder; the picture of run 0 where its tracks are at hand."""
-    summary = summarise(folder)
-    manifest = folder.manifest
-    unit, metrics, labels = manifest["length_unit"], manifest["metrics"], manifest["filters"]
+def write_reports(folder: RunFolder) -> dict[str, Any]:
+    """Summary and tables of a run folder."""
+    summary, manifest = summarise(folder), folder.manifest
     folder.write_json(SUMMARY_FILE, summary)
-    if metrics:
-        folder.write_text("table.md", summary_table(summary, unit).render("markdown"))
-        if manifest["steps"] > 1:
-            scored = {label: curves(folder, label) for label in labels}
-            folder.write_bytes(
-                "over_time.png", over_time_figure(scored, metrics, unit, maneuvers=manifest["maneuvers"])
-            )
+    if manifest["metrics"]:
+        folder.write_text("table.md", summary_table(summary, manifest["length_unit"]).render("markdown"))
     if manifest["identity"]["config"]["traces"]:
         folder.write_text("estimates.csv", estimates_table(folder).render("csv"))
+    return summary
+
+
+def write_figures(folder: RunFolder, first_run: dict[str, np.ndarray]) -> None:
+    """Metrics over time, and the picture of run 0 where its tracks are at hand."""
+    manifest = folder.manifest
+    unit, metrics, labels = manifest["length_unit"], manifest["metrics"], manifest["filters"]
+    if metrics and manifest["steps"] > 1:
+        scored = {label: curves(folder, label) for label in labels}
+        over_time = over_time_figure(scored, metrics, unit, maneuvers=manifest["maneuvers"])
+        folder.write_bytes("over_time.png", over_time)
     if first_run:
-        title = f"{manifest['title'] or summary['experiment']}: run 0"
+        title = f"{manifest['title'] or manifest['identity']['experiment']}: run 0"
         folder.write_bytes(TRACK_FIGURE, track_figure(first_run, labels, length_unit=unit, title=title))
         if is_connected(first_run):
             folder.write_bytes("animation.gif", animation(first_run, labels, title=labels[0]))
-    return summary
 
 
 class Replay(NamedTuple):

@@ -7,16 +7,24 @@ from typing import Annotated
 
 import typer
 
+ALONE = ", filter only, one run alone"
+
 
 def bench(
-    configs: Annotated[list[str] | None, typer.Argument(metavar="[CONFIG]...", help="Experiments to time.")] = None,
+    configs: Annotated[
+        list[str] | None, typer.Argument(metavar="[CONFIG|PAPER]...", help="Experiments to time, or papers.")
+    ] = None,
     repetitions: Annotated[int, typer.Option(min=1, help="Interleaved repetitions; the median counts.")] = 7,
 ) -> None:
     """Time simulation, filters, and filters with metrics, per run and step, interleaved in one process.
 
+    Filters are timed on a whole chunk of runs and on a single run alone.
+
     Example: emt bench tuncer2021/trajectory_uniform
     """
     from emt.config.load import load_experiment
+    from emt.config.shipped import config_names, papers
+    from emt.reports.paper import published_of
     from emt.reports.table import Column, Table
     from emt.runner import build_program
 
@@ -26,7 +34,12 @@ def bench(
         Column("ratio", "ratio", True),
         Column("compile", "compile s", True),
     ]
+    names: list[str] = []
     for name in configs or ["tuncer2021/trajectory_uniform"]:
+        published = published_of(name) if name in papers() else None
+        listed = published.benchmarks if published else ()
+        names += [*(listed or config_names(name))] if name in papers() else [name]
+    for name in names:
         loaded = load_experiment(name)
         parts, compile_seconds = timed_parts(build_program(loaded), loaded)
         samples: dict[str, list[float]] = {part: [] for part in parts}
@@ -36,13 +49,13 @@ def bench(
                 call()
                 samples[part].append(time.perf_counter() - started)
         medians = {part: statistics.median(times) for part, times in samples.items()}
-        steps = loaded.experiment.chunk_size * getattr(loaded.experiment.scenario, "n_steps", 1)
-        fastest = min(medians.values())
+        n_steps, chunk = getattr(loaded.experiment.scenario, "n_steps", 1), loaded.experiment.chunk_size
+        fastest = min(seconds for part, seconds in medians.items() if not part.endswith(ALONE))
         rows = [
             {
                 "part": part,
-                "us": f"{1e6 * seconds / steps:.2f}",
-                "ratio": f"{seconds / fastest:.1f}",
+                "us": f"{1e6 * seconds / (n_steps * (1 if part.endswith(ALONE) else chunk)):.2f}",
+                "ratio": "" if part.endswith(ALONE) else f"{seconds / fastest:.1f}",
                 "compile": f"{compile_seconds[part]:.1f}",
             }
             for part, seconds in medians.items()
@@ -76,4 +89,6 @@ def timed_parts(program, loaded):
         arguments = (program.world, program.filter_params[label], seed, runs, simulation.scans, simulation.truth)
         add(f"{label}, filter only", bare.scorer(label), arguments)
         add(f"{label}, with metrics", program.scorer(label), arguments)
+        first = jax.tree.map(lambda leaf: leaf[:1], (simulation.scans, simulation.truth))
+        add(f"{label}{ALONE}", bare.scorer(label), (*arguments[:3], runs[:1], *first))
     return calls, compile_seconds

@@ -95,7 +95,7 @@ def check(
     changes = []
     with tempfile.TemporaryDirectory() as scratch:
         for item in loaded:
-            summary = run_shown(item, Path(scratch) / item.name)
+            summary = run_shown(item, Path(scratch) / item.name, figures=False)
             now = baseline_of(summary, environment())
             if update:
                 path = paths[item.name]

@@ -152,12 +152,13 @@ def animation(arrays: Mapping[str, np.ndarray], labels: Sequence[str], run_index
         np.concatenate([np.linspace(0, settling - 1, FRAMES // 4), np.linspace(0, n_steps - 1, FRAMES)]).astype(int)
     )
     styles, frames = styles_of(labels[:1]), []
+    figure = Figure(figsize=(FRAME_INCHES, FRAME_INCHES), dpi=FRAME_DPI)
+    ax, canvas = figure.add_axes((0.09, 0.06, 0.89, 0.87)), FigureCanvasAgg(figure)
+    ax.tick_params(labelsize=7.0)
     for step in steps:
-        figure = Figure(figsize=(FRAME_INCHES, FRAME_INCHES), dpi=FRAME_DPI, layout="constrained")
-        ax = figure.subplots()
+        ax.clear()
         draw_step(ax, movie, styles, int(step))
         ax.set_title(plain(f"{title}  scan {step + 1}".strip()), fontsize=8.0)
-        canvas = FigureCanvasAgg(figure)
         canvas.draw()
         frame = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
         frames.append(frame.quantize(24, dither=Image.Dither.NONE))

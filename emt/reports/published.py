@@ -52,6 +52,8 @@ class Published(Settings):
     definitions: dict[str, str] = Field(default_factory=dict)
     tables: tuple[PublishedTable, ...] = ()
     claims: tuple[Claim, ...] = ()
+    benchmarks: tuple[str, ...] = ()
+    """Experiments that `emt bench PAPER` times; by default all."""
     animations: tuple[str, ...] = ()
     """Experiments whose animation belongs in the report."""
 

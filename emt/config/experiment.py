@@ -69,6 +69,8 @@ class MonteCarlo(Settings):
     """Runs at the reduced scale of `emt check` and `emt reproduce --scale smoke`."""
     smoke_settings: dict[str, int] = Field(default_factory=dict)
     """Settings that are different at that scale, by their dotted keys: fewer steps, say."""
+    smoke_filters: tuple[Label, ...] = ()
+    """Filters that take part at that scale; by default all."""
     seed: Annotated[NonNegativeInt, Field(lt=2**63)] = 0
     chunk: Annotated[PositiveInt, Field(le=1_000_000)] | None = None
     """Runs computed together, part of a result's identity; by default 208, and 1 for recordings. Multiples of 16 that

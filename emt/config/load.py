@@ -1,5 +1,6 @@
 """From a file or a shipped name to a checked experiment."""
 
+import copy
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -96,6 +97,10 @@ def at_smoke_scale(loaded: Loaded) -> Loaded:
     runs = loaded.experiment.monte_carlo.smoke_runs
     texts = [f"monte_carlo.runs={runs}", *(f"{key}={value}" for key, value in settings.items())]
     source = apply_overrides(loaded.source, texts)
+    if kept := loaded.experiment.monte_carlo.smoke_filters:
+        data: Any = copy.deepcopy(source.data)
+        data["filters"] = {label: settings for label, settings in data["filters"].items() if label in kept}
+        source = Source(source.path, data, source.places)
     return Loaded(loaded.name, check(source, Path(loaded.source.path)), source)
 
 
@@ -153,6 +158,10 @@ def contradictions(experiment: Experiment, source: Source) -> Iterable[Problem]:
     labels = ["truth", *experiment.filters]
     if "truth" in experiment.filters:
         yield problem_at(source, ("filters", "truth"), "a filter cannot be called 'truth'")
+    for k, label in enumerate(experiment.monte_carlo.smoke_filters):
+        if label not in experiment.filters:
+            name = UnknownName(label, experiment.filters, suggest(label, experiment.filters), "filter")
+            yield problem_at(source, ("monte_carlo", "smoke_filters", k), str(name))
     if experiment.reference not in labels:
         name = UnknownName(experiment.reference, labels, suggest(experiment.reference, labels), "reference")
         yield problem_at(source, ("reference",), str(name))

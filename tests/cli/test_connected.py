@@ -100,3 +100,10 @@ def test_smoke_scale_has_fewer_steps():
     assert small.experiment.scenario.steps < loaded.experiment.scenario.steps == 12_600
     assert small.experiment.monte_carlo.runs == loaded.experiment.monte_carlo.smoke_runs
     assert small.name == loaded.name
+
+
+def test_smoke_scale_may_have_fewer_filters():
+    assert list(at_smoke_scale(load_experiment("zea2014/association")).experiment.filters) == [
+        "printed_disc",
+        "augmented",
+    ]

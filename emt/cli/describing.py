@@ -81,7 +81,9 @@ def settings_of(settings: Any, path: tuple[str, ...] = ()) -> list[tuple[tuple[s
         for key, group in groups:
             rows.extend(settings_of(group, key))
         if not groups:
-            rows.append((here, value, field_unit(type(settings), name)))
+            unit = field_unit(type(settings), name)
+            single = {(*here, str(key)): item for key, item in value.items()} if isinstance(value, dict) else {}
+            rows.extend((key, item, unit) for key, item in (single or {here: value}).items())
     return rows
 
 
@@ -108,7 +110,10 @@ def schema() -> None:
 
     Example: emt schema > emt.schema.json
     """
-    from emt.config.experiment import Experiment
+    from pydantic import TypeAdapter
 
-    content = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Experiment.model_json_schema()}
+    from emt.config.experiment import ConnectedExperiment, Experiment
+
+    either = TypeAdapter(Experiment | ConnectedExperiment).json_schema()
+    content = {"$schema": "https://json-schema.org/draft/2020-12/schema", **either}
     typer.echo(json.dumps(content, indent=2, ensure_ascii=False))

@@ -98,6 +98,11 @@ def at_smoke_scale(loaded: Loaded) -> Loaded:
     texts = [f"monte_carlo.runs={runs}", *(f"{key}={value}" for key, value in settings.items())]
     source = apply_overrides(loaded.source, texts)
     if kept := loaded.experiment.monte_carlo.smoke_filters:
+        known, key = list(loaded.experiment.filters), ("monte_carlo", "smoke_filters")
+        unknown = [(k, UnknownName(name, known, suggest(name, known), "filter")) for k, name in enumerate(kept)]
+        problems = [problem_at(source, (*key, k), str(error)) for k, error in unknown if error.name not in known]
+        if problems:
+            raise ConfigError(problems)
         data: Any = copy.deepcopy(source.data)
         data["filters"] = {label: settings for label, settings in data["filters"].items() if label in kept}
         source = Source(source.path, data, source.places)
@@ -158,10 +163,6 @@ def contradictions(experiment: Experiment, source: Source) -> Iterable[Problem]:
     labels = ["truth", *experiment.filters]
     if "truth" in experiment.filters:
         yield problem_at(source, ("filters", "truth"), "a filter cannot be called 'truth'")
-    for k, label in enumerate(experiment.monte_carlo.smoke_filters):
-        if label not in experiment.filters:
-            name = UnknownName(label, experiment.filters, suggest(label, experiment.filters), "filter")
-            yield problem_at(source, ("monte_carlo", "smoke_filters", k), str(name))
     if experiment.reference not in labels:
         name = UnknownName(experiment.reference, labels, suggest(experiment.reference, labels), "reference")
         yield problem_at(source, ("reference",), str(name))

@@ -121,6 +121,7 @@ def test_list_and_schema(capsys):
     schema = emt(capsys, "schema")
     assert schema.code == 0
     assert '"vb_random_matrix"' in schema.out
+    assert '"ConnectedModelSettings"' in schema.out
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from emt.config.errors import ConfigError
 from emt.config.load import at_smoke_scale, load_experiment
 from emt.config.shipped import config_path
 from emt.status import Status
@@ -107,3 +108,6 @@ def test_smoke_scale_may_have_fewer_filters():
         "printed_disc",
         "augmented",
     ]
+    renamed = load_experiment("zea2014/association", ["monte_carlo.smoke_filters=[augmentd]"])
+    with pytest.raises(ConfigError, match="did you mean 'augmented'"):
+        at_smoke_scale(renamed)

@@ -55,8 +55,8 @@ def standard_error(values: np.ndarray) -> float:
     return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
-def shares_of(metric: Metric, rows: jax.Array, sound: jax.Array) -> jax.Array:
-    """What each run (run,) contributes to a metric, from its values per step (run, step).
+def shares_of(metric: Metric, values: jax.Array, rows: jax.Array, sound: jax.Array) -> jax.Array:
+    """What each run (run,) contributes to a metric, from its value (run,) and those of its steps (run, step).
 
     For a mean it is the value of the run. For a root mean square over runs, averaged over steps, it is the first-order
     share mean_k (√m_k + (e²_k - m_k) / 2√m_k), with m_k the mean square at step k: shares average to the value exactly
@@ -68,8 +68,7 @@ def shares_of(metric: Metric, rows: jax.Array, sound: jax.Array) -> jax.Array:
         root = jnp.sqrt(rows.sum(axis=0) / used)
         safe = jnp.where(root > 0.0, root, 1.0)
         return jnp.where(sound, (0.5 * root[None, :] + 0.5 * rows / safe[None, :]).mean(axis=1), 0.0)
-    means = rows.mean(axis=1)
-    return jnp.where(sound, jnp.sqrt(means) if metric.over_time == "rms" else means, 0.0)
+    return jnp.where(sound, values, 0.0)
 
 
 class Data(NamedTuple):
@@ -110,7 +109,8 @@ class Batch:
         scores = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))(world, trial.params, *data)
         sound = (scores.status & int(FAILURE)) == 0
         rows = scores.per_step[:, program.experiment.skip_steps :]
-        return jnp.stack([shares_of(m, rows[:, :, k], sound) for k, m in enumerate(self.metrics)]), sound
+        values = scores.values
+        return jnp.stack([shares_of(m, values[:, k], rows[:, :, k], sound) for k, m in enumerate(self.metrics)]), sound
 
     def score(
         self, trials: Sequence[Built], on_progress: Callable[[int], None] = lambda done: None

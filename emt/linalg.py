@@ -299,3 +299,31 @@ def cholesky(matrix):
         columns.append(column)
         rest = rest - column[:, None] * column[None, :]
     return jnp.stack(columns, axis=1)
+
+
+def semidefinite_root(matrix):
+    """Lower triangular root of a small covariance (n, n) that may be singular.
+
+    A pivot of less than 1e-12 of its variance (1e-5 in single precision) counts as zero.
+    """
+    rest, columns = matrix, []
+    tolerance = 1e-12 if matrix.dtype == jnp.float64 else 1e-5
+    below = jnp.arange(matrix.shape[0])
+    for j in range(matrix.shape[0]):
+        pivot = rest[j, j]
+        sound = pivot > tolerance * matrix[j, j]
+        column = jnp.where(sound & (below >= j), rest[:, j] / jnp.sqrt(jnp.where(sound, pivot, 1.0)), 0.0)
+        columns.append(column)
+        rest = rest - column[:, None] * column[None, :]
+    return jnp.stack(columns, axis=1)
+
+
+def forward_solve(root, right):
+    """root⁻¹ right for a lower triangular root (n, n), right (n,) or (n, k), row by row in plain operations."""
+    rows = []
+    for i in range(root.shape[0]):
+        rest = right[i]
+        for j in range(i):
+            rest = rest - root[i, j] * rows[j]
+        rows.append(rest / root[i, i])
+    return jnp.stack(rows)

@@ -146,6 +146,46 @@ class Covariance(Vector):
         return {"anyOf": [rows, row, diagonal], "unit": ", ".join(self.entry_units)}
 
 
+@dataclass(frozen=True)
+class SquareMatrix:
+    """Marks ``Matrix`` as a covariance whose size and units the settings around it fix: numbers in SI units.
+
+    Accepts what ``Covariance`` does.
+    """
+
+    semidefinite: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
+        def checked(value: Any) -> Any:
+            given = value["diagonal"] if isinstance(value, Mapping) and set(value) == {"diagonal"} else value
+            n = len(given) if isinstance(given, (list, tuple)) else 0
+            if n == 0:
+                raise refusal(f"expected rows of numbers or a list of variances, got {describe(value)}")
+            try:
+                return Covariance(n, "1", self.semidefinite).check(value)
+            except ValueError as error:
+                raise refusal(str(error)) from None
+
+        return core_schema.no_info_plain_validator_function(checked)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        row = {"type": "array", "items": {"type": "number"}}
+        diagonal = {
+            "type": "object",
+            "properties": {"diagonal": row},
+            "required": ["diagonal"],
+            "additionalProperties": False,
+        }
+        return {"anyOf": [{"type": "array", "items": row}, row, diagonal]}
+
+
+def check_square(name: str, rows: Matrix, n: int) -> list[str]:
+    """What is wrong with the shape of a matrix that should be n by n."""
+    if len(rows) == n and all(len(row) == n for row in rows):
+        return []
+    return [f"{name}: expected {n} rows of {n} numbers, got {len(rows)} rows of {', '.join(str(len(r)) for r in rows)}"]
+
+
 def _check_covariance(matrix: Matrix, semidefinite: bool) -> None:
     n = len(matrix)
     for i in range(n):

@@ -7,7 +7,7 @@ with a method ``build``.
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib import import_module, metadata
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -136,7 +136,7 @@ class Registry(Generic[T]):
         return self._plugins
 
 
-def _load(name: str, target: str) -> Entry[Any]:
+def _import(name: str, target: str) -> Any:
     module, _, attributes = target.partition(":")
     try:
         found: Any = import_module(module)
@@ -144,6 +144,25 @@ def _load(name: str, target: str) -> Entry[Any]:
             found = getattr(found, attribute)
     except Exception as error:  # somebody else's code: whatever it raises is a message
         raise PluginError(f"plug-in {name!r} cannot be imported: {type(error).__name__}: {error}") from error
+    return found
+
+
+def load_function(reference: str) -> Callable[..., Any]:
+    """A function of the user's, by ``package.module:attribute``.
+
+    Raises:
+        PluginError: not such a reference, or the function cannot be imported or called.
+    """
+    if not _REFERENCE.fullmatch(reference):
+        raise PluginError(f"expected 'module:function', got {reference!r}")
+    found = _import(reference, reference)
+    if not callable(found):
+        raise PluginError(f"{reference!r} is a {type(found).__name__}, not a function")
+    return found
+
+
+def _load(name: str, target: str) -> Entry[Any]:
+    found = _import(name, target)
     if isinstance(found, type) and callable(getattr(found, "build", None)):
         settings, builder = found, getattr(found, "build")  # noqa: B009
     elif isinstance(found, tuple) and len(found) >= 2:

@@ -84,6 +84,12 @@ def build_program(loaded: Loaded) -> Program:
         for k, metric in enumerate(program.metrics)
         if labels != [loaded.experiment.reference] and program.without(metric) == labels
     ]
+    if any(metric.needs_mode for metric in program.metrics) and not program.tells_mode():
+        problems += [
+            problem_at(loaded.source, ("metrics", k), f"'{metric.name}' needs a scenario that tells the true mode")
+            for k, metric in enumerate(program.metrics)
+            if metric.needs_mode
+        ]
     if problems:
         raise ConfigError(problems)
     return program
@@ -95,6 +101,7 @@ def metric_facts(program: Program) -> list[dict[str, Any]]:
     return [
         {name: getattr(m, name) for name in shown}
         | {"unit": program.unit_of(m), "counted": m.counts is not None, "without": program.without(m)}
+        | ({"dof": program.dof_of(m)} if m.dof is not None else {})
         for m in program.metrics
     ]
 

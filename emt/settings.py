@@ -27,7 +27,7 @@ Other units: ``Annotated[float, Quantity("m/s^2", gt=0)]``, ``Annotated[Matrix, 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, ClassVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
 from pydantic_core import core_schema
@@ -59,6 +59,12 @@ class Settings(BaseModel):
             kinds = [get_origin(part) or part for part in _parts(field.annotation)]
             if any(kind is list or kind is set for kind in kinds):
                 raise TypeError(f"{cls.__name__}.{name}: declare tuple[...], settings hold no lists or sets")
+
+
+class PointSettings(Settings):
+    """Settings of a filter of a point."""
+
+    tracks: ClassVar[str] = "state_space"
 
 
 def _to_tuples(data: Any) -> Any:
@@ -166,6 +172,7 @@ LengthVariance = Annotated[float, Quantity("m^2", ge=0)]
 SpeedVariance = Annotated[float, Quantity("m^2/s^2", ge=0)]
 AngleVariance = Annotated[float, Quantity("rad^2", ge=0)]
 AccelerationDensity = Annotated[float, Quantity("m^2/s^3", ge=0)]
+AccelerationVariance = Annotated[float, Quantity("m^2/s^4", ge=0)]
 PositiveFloat = Annotated[float, Quantity("1", gt=0)]
 NonNegativeFloat = Annotated[float, Quantity("1", ge=0)]
 Fraction = Annotated[float, Quantity("1", ge=0, le=1)]

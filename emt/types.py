@@ -22,8 +22,8 @@ State = Any
 class Measurements(NamedTuple):
     """One scan at fixed capacity."""
 
-    points: Float[Array, "max_points 2"]
-    """Detected points (m); padding rows may hold anything."""
+    points: Float[Array, "max_points m"]
+    """Detected points (m), or what else a sensor measures of a point object; padding rows may hold anything."""
     mask: Bool[Array, "max_points"]
     """True where a real detection sits."""
     overflow: Bool[Array, ""]
@@ -58,12 +58,36 @@ class Articulated:
     """What it is made of: a `shapes.connected.Connected`, fixed when a program is compiled."""
 
 
+POSITION, VELOCITY = ("x", "y", "z"), ("vx", "vy", "vz")
+"""Names of the entries of a state that are positions (m) and velocities (m/s)."""
+
+
+@register_dataclass
+@dataclass(frozen=True)
+class Point:
+    """Object without extent: all there is to know is its state."""
+
+    names: tuple[str, ...] = field(metadata={"static": True})
+    """Of the entries of the state."""
+    measured: int = field(metadata={"static": True})
+    """Numbers per measurement."""
+    modes: tuple[str, ...] = field(default=(), metadata={"static": True})
+    """Names that a true mode is a place in."""
+
+    def places(self, names: tuple[str, ...]) -> tuple[int, ...]:
+        """Places in the state of those of these names that it has."""
+        return tuple(self.names.index(name) for name in names if name in self.names)
+
+
 class Truth(NamedTuple):
     """True object at one step."""
 
     state: Float[Array, "n"]
-    """Of an ellipse: position (m) and velocity (m/s) x, y, vx, vy. Of a connected object: its parameters."""
-    shape: Ellipse | Articulated
+    """Of an ellipse: position (m) and velocity (m/s) x, y, vx, vy. Of a connected object: its parameters. Of a point:
+    as its names say."""
+    shape: Ellipse | Articulated | Point
+    mode: Int[Array, ""] | None = None
+    """Place of the true mode, or of the model closest to it, in the names of a point's modes."""
 
     @staticmethod
     def moving(position: Float[Array, "2"], velocity: Float[Array, "2"], ellipse: Ellipse) -> "Truth":
@@ -112,9 +136,9 @@ class Estimate(NamedTuple):
     """What a filter reports; the only thing metrics see of it."""
 
     mean: Float[Array, "n"]
-    """Of an ellipse: position (m) and velocity (m/s) x, y, vx, vy. Of a connected object: its parameters."""
+    """Of an ellipse: position (m) and velocity (m/s) x, y, vx, vy. Of others: their state."""
     cov: Float[Array, "n n"]
-    shape: Ellipse | StarConvex | Articulated
+    shape: Ellipse | StarConvex | Articulated | Point
     modes: dict[str, Scalar] | None = None
     """Probability of each motion mode by name, for multiple-model filters."""
 
@@ -131,6 +155,10 @@ class Info(NamedTuple):
     confusion: Float[Array, "c c"] | None = None
     """Points from component i (row) that were given to component j, as sums of association weights; from filters of
     connected objects where the scan tells the sources."""
+    effective_samples: Scalar | None = None
+    """Effective sample size of a particle filter before resampling, as a fraction of its particles."""
+    active_models: Scalar | None = None
+    """Models that a multiple-model filter ran in this step."""
 
 
 class Filter(NamedTuple):

@@ -16,14 +16,14 @@ import emt.filters.catalogue
 import emt.metrics.catalogue
 import emt.scenarios.catalogue  # noqa: F401  (these three fill the registries)
 from emt.config.connected_model import ConnectedModelSettings
-from emt.metrics.base import find_metric
+from emt.config.state_space_model import StateSpaceModelSettings
+from emt.metrics.base import Metric, RmseRule, find_metric, under_rule
+from emt.models.motion import NoiseSettings
 from emt.registry import FILTERS, SCENARIOS, Entry, Registry
 from emt.settings import (
-    AccelerationDensity,
     Angle,
     Covariance4,
     Fraction,
-    KinematicNoise,
     NoiseCovariance,
     PositiveFloat,
     PositiveLength,
@@ -78,22 +78,6 @@ class MonteCarlo(Settings):
     dtype: Literal["float64", "float32"] = "float64"
 
 
-class WhiteAccelerationSettings(Settings):
-    """Nearly constant velocity with white acceleration."""
-
-    kind: Literal["white_acceleration"] = "white_acceleration"
-    psd: AccelerationDensity
-    """Power spectral density of the acceleration on each axis."""
-
-
-class FixedNoiseSettings(Settings):
-    """The same process noise at every step."""
-
-    kind: Literal["fixed"] = "fixed"
-    cov: KinematicNoise
-    """Covariance added to (x, y, vx, vy) per step."""
-
-
 class PriorSettings(Settings):
     """What every filter believes before the first scan. Its certainty about the shape is a setting of each filter."""
 
@@ -130,7 +114,7 @@ class PriorSettings(Settings):
 class ModelSettings(Settings):
     """The world as every filter is told it is."""
 
-    process_noise: Annotated[WhiteAccelerationSettings | FixedNoiseSettings, Field(discriminator="kind")]
+    process_noise: NoiseSettings
     """Process noise of the constant-velocity motion."""
     noise_cov: NoiseCovariance
     """Covariance of the sensor noise of one point."""
@@ -189,6 +173,9 @@ class Experiment(Settings):
     filters: Annotated[dict[Label, union_of(FILTERS)], Field(min_length=1)]  # type: ignore[valid-type]
     reference: str = "truth"
     """What estimates are compared with: the truth, or the filter with this label."""
+    rmse: RmseRule = "per_step"
+    """How root-mean-square errors (`position_rmse`, `velocity_rmse`) average over steps: "per_step", root over runs at
+    each step, then the mean over steps; or "pooled", one root of the mean over runs and steps."""
     metrics: tuple[MetricName, ...] = ("gw", "iou", "position_rmse", "velocity_rmse", "nees")
     skip_steps: NonNegativeInt = 0
     """Steps at the start that do not count in the averages over time."""
@@ -196,6 +183,14 @@ class Experiment(Settings):
     traces: bool = False
     """Whether every estimate of every run is stored."""
     sources: Sources = Sources()
+
+    def metric(self, name: str) -> Metric:
+        """The metric of that name, under the experiment's rules.
+
+        Raises:
+            UnknownName: there is none.
+        """
+        return under_rule(find_metric(name), self.rmse)
 
     @property
     def chunk_size(self) -> int:
@@ -209,6 +204,16 @@ class ConnectedExperiment(Experiment):
     model: ConnectedModelSettings  # type: ignore[assignment]
 
 
+class StateSpaceExperiment(Experiment):
+    """An experiment on a point."""
+
+    model: StateSpaceModelSettings  # type: ignore[assignment]
+
+
+EXPERIMENTS: dict[Any, type[Experiment]] = {"connected": ConnectedExperiment, "state_space": StateSpaceExperiment}
+"""Experiments by the kind of their model, which is that of an ellipse if none is given."""
+
+
 def model_for(data: Any) -> type[Experiment]:
     """The settings class for a file's content: `Experiment`, widened by the plug-ins the file names.
 
@@ -218,11 +223,11 @@ def model_for(data: Any) -> type[Experiment]:
     if not isinstance(data, dict):
         return Experiment
     filters, scenario, model = data.get("filters"), data.get("scenario"), data.get("model")
-    is_connected = isinstance(model, dict) and model.get("kind") == "connected"
+    kind = model.get("kind") if isinstance(model, dict) else None
     named = [f.get("kind") for f in filters.values() if isinstance(f, dict)] if isinstance(filters, dict) else []
     plugin_filters = _plugins(FILTERS, named)
     plugin_scenarios = _plugins(SCENARIOS, [scenario.get("kind")] if isinstance(scenario, dict) else [])
-    base = ConnectedExperiment if is_connected else Experiment
+    base = EXPERIMENTS.get(kind, Experiment) if isinstance(kind, str) else Experiment
     if not plugin_filters and not plugin_scenarios:
         return base
     widened: Any = {

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from emt.config.connected_model import ConnectedModelSettings
 from emt.config.errors import ConfigError, Problem, dotted, validate
 from emt.config.experiment import Experiment, model_for
 from emt.config.overrides import apply_overrides
@@ -188,7 +187,7 @@ def mismatches(experiment: Experiment, source: Source) -> Iterable[Problem]:
     """Scenario, filters, metrics and model that are not about the same kind of object."""
     model = experiment.model
     kind = getattr(model, "kind", "ellipse")
-    what = {"ellipse": "an ellipse", "connected": "a connected object"}
+    what = {"ellipse": "an ellipse", "connected": "a connected object", "state_space": "a point (state_space)"}
     parts = [(("scenario",), experiment.scenario)]
     parts += [(("filters", label), settings) for label, settings in experiment.filters.items()]
     for path, settings in parts:
@@ -196,17 +195,30 @@ def mismatches(experiment: Experiment, source: Source) -> Iterable[Problem]:
         if theirs != kind:
             message = f"'{settings.kind}' is about {what[theirs]}, the model about {what[kind]}"
             yield problem_at(source, (*path, "kind"), message)
-        elif isinstance(model, ConnectedModelSettings) and hasattr(settings, "faults_with"):
-            for key, fault in settings.faults_with(model.shape, model.noise_cov):
-                yield problem_at(source, (*path, key), fault)
+        elif hasattr(settings, "faults_with"):
+            for key, fault in settings.faults_with(model):
+                parts = [int(part) if part.isdigit() else part for part in key.split(".")]
+                yield problem_at(source, (*path, *parts), fault)
     rule = experiment.divergence
-    if kind != "ellipse" and rule is not None and (rule.position_error_above or rule.final_iou_below) is not None:
-        yield problem_at(source, ("divergence",), "position and IoU are those of an ellipse; use final_mean_above")
+    yield from divergence_mismatches(experiment, source, kind)
     if kind != "ellipse" and experiment.reference != "truth":
-        yield problem_at(source, ("reference",), "connected objects are compared with the truth only")
+        yield problem_at(source, ("reference",), f"{what[kind]} is compared with the truth only")
     for name in rule.final_mean_above if rule is not None else ():
         if name not in experiment.metrics:
             yield problem_at(source, ("divergence", "final_mean_above", name), "is not among the metrics")
+
+
+def divergence_mismatches(experiment: Experiment, source: Source, kind: str) -> Iterable[Problem]:
+    """Rules of divergence that the kind of object does not have."""
+    rule = experiment.divergence
+    if rule is None or kind == "ellipse":
+        return
+    has_position = kind == "state_space" and "x" in getattr(experiment.model, "states", ())
+    if rule.position_error_above is not None and not has_position:
+        key = ("divergence", "position_error_above")
+        yield problem_at(source, key, "this object has no position; use final_mean_above")
+    if rule.final_iou_below is not None:
+        yield problem_at(source, ("divergence", "final_iou_below"), "IoU is that of an ellipse; use final_mean_above")
 
 
 def has_key(data: Any, path: Sequence[str]) -> bool:

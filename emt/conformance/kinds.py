@@ -18,6 +18,7 @@ from emt.conformance.golden import (
     scan_of,
     time_step,
 )
+from emt.conformance.point_kinds import compare_ekf, compare_imm, compare_ukf, compare_vsimm
 from emt.conformance.sampling_kinds import compare_lcd_samples, compare_s2kf_updates
 from emt.conformance.shape_kinds import compare_ellipse_iou, compare_gaussian_wasserstein, compare_moment_update
 from emt.filters import feldmann, gp_ett
@@ -293,4 +294,8 @@ KINDS = {
     "moment_update": Kind(compare_moment_update, 1e-12),
     "ellipse_iou": Kind(compare_ellipse_iou, 1e-6),
     "gaussian_wasserstein": Kind(compare_gaussian_wasserstein, DEFAULT_TOLERANCE),
+    "ekf": Kind(compare_ekf, 1e-10),
+    "ukf": Kind(compare_ukf, 1e-10),
+    "imm": Kind(compare_imm, 1e-10),
+    "vsimm": Kind(compare_vsimm, 1e-10),
 }

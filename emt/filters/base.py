@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
 from emt.models.motion import MotionNoise
 from emt.status import Status
-from emt.types import Articulated, Ellipse, Estimate, Filter, Info, Measurements, Scalar, State, Traced
+from emt.types import Articulated, Ellipse, Estimate, Filter, Info, Measurements, Point, Scalar, State, Traced
 
 GROSS_INNOVATION = 10.0
 """An innovation of more than this many predicted standard deviations sets `Status.GROSS_INNOVATION`."""
@@ -108,7 +108,7 @@ def estimate_status(estimate: Estimate) -> Int[Array, ""]:
 
     Of a general state only the variances are looked at: the next factorisation shows the rest.
     """
-    if isinstance(estimate.shape, Articulated):
+    if isinstance(estimate.shape, Articulated | Point):
         sound = (jnp.diagonal(estimate.cov) > 0.0).all()
         bits = jnp.where(sound, 0, int(Status.NOT_POSITIVE_DEFINITE))
         return jnp.where(all_finite(estimate), bits, int(Status.NON_FINITE))

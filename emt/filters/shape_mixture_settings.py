@@ -7,7 +7,7 @@ from pydantic import Field, PositiveInt, model_validator
 
 from emt.models.switching import SwitchingSettings
 from emt.settings import Fraction, Length, PositiveFloat, Quantity, Settings
-from emt.shapes.connected import ConnectedSettings, Name, connected, probability_faults
+from emt.shapes.connected import Name, connected, probability_faults
 
 GateProbability = Annotated[float, Quantity("1", gt=0, lt=1)]
 
@@ -107,16 +107,16 @@ class ShapeMixtureSettings(Settings):
                 raise ValueError("; ".join(faults))
         return self
 
-    def faults_with(self, shape: ConnectedSettings, noise_cov: Any) -> list[tuple[str, str]]:
-        """(key, what is wrong) for an object and the sensor noise of a model."""
-        plan = connected(shape)
+    def faults_with(self, model: Any) -> list[tuple[str, str]]:
+        """(key, what is wrong) for the object and the sensor noise of a model."""
+        plan = connected(model.shape)
         faults = [("probabilities", fault) for fault in probability_faults(self.probabilities, plan.components)]
         if self.markov is not None:
             faults += [("markov", fault) for fault in self.markov.faults(plan.components)]
         if fault := self.samples.fault(len(plan.state) + (3 if self.sensor_noise == "augmented" else 1)):
             faults.append(("samples", fault))
         if self.sensor_noise == "additive":
-            (a, b), (_, d) = noise_cov
+            (a, b), (_, d) = model.noise_cov
             if a != d or b != 0.0:
                 faults.append(("sensor_noise", "the noise_cov of the model is not isotropic: use 'augmented'"))
             if plan.bodies:

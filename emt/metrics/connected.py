@@ -8,7 +8,7 @@ from emt.linalg import Vec2
 from emt.metrics.base import FAMILIES, Metric, of_connected, register
 from emt.shapes.articulated import angle_period, boundary_points, distances, mirrored_parameters
 from emt.shapes.connected import Connected
-from emt.types import Articulated, Estimate, Info, Scalar, Truth
+from emt.types import POSITION, VELOCITY, Articulated, Estimate, Info, Point, Scalar, Truth
 
 
 def plan_of(estimate: Estimate) -> Connected | None:
@@ -18,6 +18,8 @@ def plan_of(estimate: Estimate) -> Connected | None:
 
 def place_of(name: str, estimate: Estimate) -> int:
     """Place of a parameter in the state, -1 if there is none."""
+    if isinstance(estimate.shape, Point):
+        return estimate.shape.names.index(name) if name in estimate.shape.names else -1
     plan = plan_of(estimate)
     return plan.state.index(name) if plan is not None and name in plan.state else -1
 
@@ -25,6 +27,8 @@ def place_of(name: str, estimate: Estimate) -> int:
 def unit_of(name: str, estimate: Estimate) -> str:
     """Unit of an entry of the state."""
     plan, k = plan_of(estimate), place_of(name, estimate)
+    if isinstance(estimate.shape, Point):
+        return "L" if name in POSITION else "L/s" if name in VELOCITY else "1"
     if plan is None or k not in {*plan.angles, *(angle + 1 for angle in plan.angles)}:
         return "L"
     return "rad" if k in plan.angles else "rad/s"

@@ -1,14 +1,17 @@
-"""Motion models with their process noise."""
+"""Process noise of motion in the plane, with its settings."""
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from emt.linalg import Mat2, Sym2
+from emt.settings import AccelerationDensity, AccelerationVariance, KinematicNoise, Settings
 from emt.types import Scalar, Traced
 
 
@@ -79,4 +82,60 @@ class FixedNoise:
         return self.noise
 
 
-MotionNoise = WhiteAcceleration | FixedNoise
+@register_dataclass
+@dataclass(frozen=True)
+class PiecewiseAcceleration:
+    """Noise of an acceleration that is constant over each step: variance G Gᵀ with G = (T²/2, T) on each axis.
+
+    Source: Bar-Shalom, Li and Kirubarajan 2001, eq. 6.3.2-4.
+    """
+
+    variance: Traced
+    """Of the acceleration on each axis (m²/s⁴)."""
+
+    def __call__(self, dt: Scalar) -> ProcessNoise:
+        """Noise over a step of `dt` seconds; the velocity noise is 2/T times that of the position."""
+        zero = jnp.zeros_like(self.variance * dt)
+        variance, slope = self.variance * dt**4 / 4.0, 2.0 / dt + zero
+        return ProcessNoise(Sym2(variance, zero, variance), Mat2(slope, zero, zero, slope), Sym2(zero, zero, zero))
+
+
+MotionNoise = WhiteAcceleration | FixedNoise | PiecewiseAcceleration
+
+
+class WhiteAccelerationSettings(Settings):
+    """White acceleration."""
+
+    kind: Literal["white_acceleration"] = "white_acceleration"
+    psd: AccelerationDensity
+    """Power spectral density of the acceleration on each axis."""
+
+    def build(self) -> WhiteAcceleration:
+        return WhiteAcceleration(self.psd)
+
+
+class FixedNoiseSettings(Settings):
+    """The same process noise at every step."""
+
+    kind: Literal["fixed"] = "fixed"
+    cov: KinematicNoise
+    """Covariance added to (x, y, vx, vy) per step."""
+
+    def build(self) -> FixedNoise:
+        return FixedNoise.of(self.cov)
+
+
+class PiecewiseAccelerationSettings(Settings):
+    """An acceleration drawn anew for each step and constant over it."""
+
+    kind: Literal["piecewise_acceleration"] = "piecewise_acceleration"
+    variance: AccelerationVariance
+    """Of the acceleration on each axis."""
+
+    def build(self) -> PiecewiseAcceleration:
+        return PiecewiseAcceleration(self.variance)
+
+
+NoiseSettings = Annotated[
+    WhiteAccelerationSettings | FixedNoiseSettings | PiecewiseAccelerationSettings, Field(discriminator="kind")
+]

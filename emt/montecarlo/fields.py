@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from emt.shapes.articulated import bodies_of, segments_of
 from emt.shapes.ellipse import equivalent_ellipse
-from emt.types import Articulated, Estimate, StarConvex, Truth
+from emt.types import Articulated, Estimate, Point, StarConvex, Truth
 
 Fields = dict[str, Float[Array, "..."]]
 
@@ -36,10 +36,13 @@ def estimate_fields(estimate: Estimate, full: bool) -> Fields:
     """The shape of one estimate.
 
     Of an ellipse or a star-convex shape: `center` (2,), `semi_axes` (2,) and `orientation` of the shape or of the
-    ellipse that stands for it, and `radii` if `full`. Of a connected object: see `connected_fields`.
+    ellipse that stands for it, and `radii` if `full`. Of a connected object: see `connected_fields`. Of a point:
+    nothing.
     """
     if isinstance(estimate.shape, Articulated):
         return connected_fields(estimate.shape)
+    if isinstance(estimate.shape, Point):
+        return {}
     offset, ellipse = equivalent_ellipse(estimate.shape)
     fields = {
         "center": estimate.mean[:2] + offset,
@@ -55,6 +58,8 @@ def truth_fields(truth: Truth) -> Fields:
     """One step of the truth."""
     if isinstance(truth.shape, Articulated):
         return {"state": truth.state, **connected_fields(truth.shape), **disc_fields(truth.shape)}
+    if isinstance(truth.shape, Point):
+        return {"state": truth.state} | ({} if truth.mode is None else {"mode": truth.mode})
     return {
         "position": truth.position,
         "velocity": truth.velocity,

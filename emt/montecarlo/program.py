@@ -12,11 +12,11 @@ import numpy as np
 from emt.config.experiment import Experiment
 from emt.filters.base import guarded
 from emt.keys import Purpose, filter_key, purpose_key, run_key
-from emt.metrics.base import Metric, find_metric
+from emt.metrics.base import Metric, has
 from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
 from emt.montecarlo.world import drawn_prior, limits_of, model_of, prior_of
 from emt.registry import FILTERS, SCENARIOS
-from emt.types import Articulated, Estimate, Measurements, Prior, Scenario, StatePrior, Truth
+from emt.types import Articulated, Estimate, Info, Measurements, Point, Prior, Scenario, StatePrior, Truth
 
 
 class Simulation(NamedTuple):
@@ -31,7 +31,7 @@ class WorldParams(NamedTuple):
 
     scenario: Any
     model: Any
-    """A `TrackingModel` or a `ConnectedModel`."""
+    """A `TrackingModel`, a `ConnectedModel` or a `StateSpaceModel`."""
     prior: Prior | StatePrior
     limits: Limits
 
@@ -81,7 +81,7 @@ class Program:
             {label: cast(params, dtype) for label, (params, _) in built.items()},
             make_scenario,
             {label: make for label, (_, make) in built.items()},
-            tuple(find_metric(name) for name in experiment.metrics),
+            tuple(experiment.metric(name) for name in experiment.metrics),
             n_steps,
         )
 
@@ -117,7 +117,7 @@ class Program:
         return [
             label
             for label in self.filter_params
-            if label == self.experiment.reference or not metric.applies_to(self.estimate_of(label))
+            if label == self.experiment.reference or not has(metric, self.estimate_of(label), self.info_of(label))
         ]
 
     def estimate_of(self, label: str) -> Estimate:
@@ -129,9 +129,29 @@ class Program:
 
         return jax.eval_shape(first)
 
+    def info_of(self, label: str) -> Info:
+        """What a filter tells of its updates."""
+        if not any(metric.reads for metric in self.metrics):
+            return Info(jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))  # no need to trace the update
+
+        def first():
+            flt, key = self.make_filter[label](self.filter_params[label], self.world.model), jax.random.key(0)
+            scans = self.simulate_run(self.world, jnp.asarray(0), jnp.asarray(0)).scans
+            scan = jax.tree.map(lambda leaf: leaf[0], scans)
+            return flt.update(flt.init(self.world.prior, key), scan, key)[1]
+
+        return jax.eval_shape(first)
+
+    def tells_mode(self) -> bool:
+        """Whether the scenario tells the true mode."""
+        key = jax.random.key(0)
+        return jax.eval_shape(lambda: self.make_scenario(self.world.scenario).sample_truth(key)).mode is not None
+
     def state_names(self) -> list[str]:
         """Names of the entries of the filters' means."""
         shape = self.estimate_of(next(iter(self.filter_params))).shape
+        if isinstance(shape, Point):
+            return list(shape.names)
         return list(shape.plan.state) if isinstance(shape, Articulated) else ["x", "y", "vx", "vy"]
 
     def unit_of(self, metric: Metric) -> str:
@@ -140,6 +160,11 @@ class Program:
             return metric.unit
         having = [label for label in self.filter_params if label not in self.without(metric)]
         return metric.unit_of(self.estimate_of(having[0])) if having else metric.unit
+
+    def dof_of(self, metric: Metric) -> int:
+        """Degrees of freedom of a metric that is a normalised square."""
+        having = [label for label in self.filter_params if label not in self.without(metric)]
+        return metric.dof(self.estimate_of(having[0])) if metric.dof is not None and having else 0
 
     def simulator(self) -> Callable[..., Simulation]:
         """Jitted (world, seed, runs) -> Simulation, mapped over runs."""

@@ -8,8 +8,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from emt.filters.base import keep_if
 from emt.keys import start_key, step_key
-from emt.metrics.base import Ending, Metric
+from emt.metrics.base import Ending, Metric, has
 from emt.metrics.iou import iou
+from emt.metrics.kinematic import position_error_squared
 from emt.montecarlo.fields import Fields, estimate_fields
 from emt.status import FAILURE, Status
 from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, State, StatePrior, Traced, Truth
@@ -117,7 +118,7 @@ def score(
 
     def values_of(estimate: Estimate, now: Truth, info: Info) -> Float[Array, "n_metrics"]:
         row = [
-            metric.per_step(estimate, now, info) if metric.applies_to(estimate) else jnp.zeros((), dt.dtype)
+            metric.per_step(estimate, now, info) if has(metric, estimate, info) else jnp.zeros((), dt.dtype)
             for metric in rules.metrics
         ]
         return jnp.stack(row) if row else jnp.zeros(0, dt.dtype)
@@ -135,8 +136,7 @@ def score(
         finite = jnp.isfinite(row).all()
         status = info.status | jnp.where(finite, 0, int(Status.NON_FINITE))
         if limits.position_error is not None:
-            dx, dy = estimate.mean[0] - now.position[0], estimate.mean[1] - now.position[1]
-            far = dx * dx + dy * dy > limits.position_error * limits.position_error
+            far = position_error_squared(estimate, now) > limits.position_error * limits.position_error
             status = status | jnp.where(far, lost_bit, 0)
         failed = jnp.where((failed < 0) & ((status & int(FAILURE)) != 0), k, failed)
         out = jnp.where(finite, row, 0.0), counts_of(estimate, now, info), report(estimate, info, status, rules.full)
@@ -168,5 +168,6 @@ def score(
             weight = counts[k][rules.first_step :]
             values.append((weight * used).sum() / jnp.maximum(weight.sum(), 1.0))
         else:
-            values.append(jnp.sqrt(used.mean()) if metric.over_time == "rms" else used.mean())
+            value = used.max() if metric.over_time == "max" else used.mean()
+            values.append(jnp.sqrt(value) if metric.over_time == "rms" else value)
     return Scores(jnp.stack(values) if values else jnp.zeros(0, dt.dtype), rows, status, failed, track)

@@ -8,10 +8,11 @@ import numpy as np
 
 from emt.config.connected_model import ConnectedModelSettings
 from emt.config.experiment import Divergence, ModelSettings
+from emt.config.state_space_model import StateSpaceModelSettings
 from emt.filters.base import TrackingModel
 from emt.filters.connected_model import ConnectedModel
 from emt.linalg import Sym2, cholesky
-from emt.models.motion import FixedNoise, WhiteAcceleration
+from emt.models.state_space.model import StateSpaceModel, state_space_model
 from emt.montecarlo.run import Limits
 from emt.shapes.connected import connected
 from emt.shapes.moments import ellipse_of
@@ -19,16 +20,15 @@ from emt.types import Ellipse, Prior, StatePrior
 
 
 @singledispatch
-def model_of(settings) -> TrackingModel | ConnectedModel:
+def model_of(settings) -> TrackingModel | ConnectedModel | StateSpaceModel:
     """The world model of a checked experiment."""
     raise TypeError(f"no model for {type(settings).__name__}")
 
 
 @model_of.register
 def _(settings: ModelSettings) -> TrackingModel:
-    noise = settings.process_noise
     return TrackingModel(
-        WhiteAcceleration(noise.psd) if noise.kind == "white_acceleration" else FixedNoise.of(noise.cov),
+        settings.process_noise.build(),
         Sym2.of(np.array(settings.noise_cov)),
         settings.extent_scale,
     )
@@ -38,6 +38,11 @@ def _(settings: ModelSettings) -> TrackingModel:
 def _(settings: ConnectedModelSettings) -> ConnectedModel:
     variances = jnp.asarray(settings.process_variance.of(settings.shape))
     return ConnectedModel(variances, Sym2.of(np.array(settings.noise_cov)), connected(settings.shape))
+
+
+@model_of.register
+def _(settings: StateSpaceModelSettings) -> StateSpaceModel:
+    return state_space_model(settings)
 
 
 @singledispatch
@@ -64,6 +69,11 @@ def _(settings: ConnectedModelSettings) -> StatePrior:
     for name, kind in settings.shape.parameters.items():
         mean += [prior.lengths[name]] if kind == "length" else [prior.angles[name], prior.rates.get(name, 0.0)]
     return StatePrior(jnp.asarray(mean), jnp.diag(jnp.asarray(prior.variance.of(settings.shape))))
+
+
+@prior_of.register
+def _(settings: StateSpaceModelSettings) -> StatePrior:
+    return StatePrior(jnp.asarray(settings.prior.mean), jnp.asarray(settings.prior.cov))
 
 
 def drawn_prior(prior: Prior | StatePrior, key) -> Prior | StatePrior:

@@ -26,6 +26,8 @@ def value_and_error(value: float | None, error: float | None) -> tuple[str, str]
         return "–", ""
     if error is None or error <= 1e-9 * abs(value):
         return significant(value, 4), ""
+    if abs(value) >= 1e7:
+        return f"{value:.1e}", f"{error:.1e}"
     decimals = decimals_for(error)
     return f"{value:.{decimals}f}", f"{error:.{decimals}f}"
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from emt.averaging import OF_SINGLE_RUNS
 from emt.reports.numbers import significant, unit_text
 from emt.reports.table import Column, Table
 from emt.status import Status
@@ -42,7 +43,7 @@ def overview_table(
     arrays: Arrays, labels: list[str], metrics: list[dict[str, Any]], title: str, length_unit: str
 ) -> Table:
     """Metrics of the run, what was flagged, and the first failed scan, per filter."""
-    shown = [(column, m) for column, m in enumerate(metrics) if m["over_runs"] != "std"]
+    shown = [(column, m) for column, m in enumerate(metrics) if m["over_runs"] in OF_SINGLE_RUNS]
     columns = [Column("filter", "filter")]
     columns += [Column(m["name"], f"{m['name']} {unit_text(m['unit'], length_unit)}".strip(), True) for _, m in shown]
     columns += [Column("flags", "flags"), Column("failed", "failed at scan", True)]

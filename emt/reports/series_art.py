@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from emt.averaging import OF_SINGLE_RUNS
 from emt.reports.numbers import unit_text
 from emt.reports.plot_style import LineStyle, plain
 from emt.reports.summary import Curve
@@ -30,7 +31,9 @@ Z95 = 1.96
 
 def chosen_metrics(metrics: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
     """The metrics worth a panel: at most so many, the telling ones first; none that is a spread over runs."""
-    usable = [m for m in metrics if m["over_runs"] != "std" and m["over_time"] != "end" and not m.get("counted")]
+    usable = [
+        m for m in metrics if m["over_runs"] in OF_SINGLE_RUNS and m["over_time"] != "end" and not m.get("counted")
+    ]
     rank = {name: place for place, name in enumerate(PREFERRED)}
     return sorted(usable, key=lambda metric: rank.get(metric["name"], len(rank)))[:most]
 

@@ -5,6 +5,7 @@ from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from emt.status import FAILURE, Status
 from emt.store import RunReader
@@ -93,6 +94,44 @@ def rms_over_runs(results: FilterResults, column: int, first_step: int) -> tuple
     return value, float(np.sqrt((blocks - 1) / blocks * np.sum((without - without.mean()) ** 2)))
 
 
+def pooled_over_runs(values: np.ndarray) -> tuple[float, float]:
+    """Root of the mean square over runs and steps from those of runs, with its standard error to first order."""
+    squares = values**2
+    value = math.sqrt(float(np.mean(squares)))
+    if len(values) < 2 or value == 0.0:
+        return value, math.nan
+    return value, float(np.std(squares, ddof=1)) / math.sqrt(len(values)) / (2.0 * value)
+
+
+def peak_over_steps(results: FilterResults, column: int, first_step: int) -> tuple[float, float]:
+    """Largest over steps of the root mean square over runs; with a standard error by the jackknife over blocks."""
+    sums, counts = results.step_sum[:, first_step:, column], results.step_count
+    sums, counts = sums[counts > 0], counts[counts > 0]
+    value = float(np.sqrt((sums.sum(axis=0) / counts.sum()).max()))
+    if len(counts) < 2:
+        return value, math.nan
+    without = np.sqrt(((sums.sum(axis=0) - sums) / (counts.sum() - counts)[:, None]).max(axis=1))
+    blocks = len(counts)
+    return value, float(np.sqrt((blocks - 1) / blocks * np.sum((without - without.mean()) ** 2)))
+
+
+def band(dof: int, runs: int) -> tuple[float, float]:
+    """Two-sided 95 % band of the mean over independent runs of a chi-square variable.
+
+    Source: Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+    """
+    low, high = chi2.ppf([0.025, 0.975], dof * runs) / runs
+    return float(low), float(high)
+
+
+def share_in_band(results: FilterResults, column: int, first_step: int, dof: int) -> float:
+    """Share of the steps at which the mean over runs lies inside its band."""
+    runs = int(results.step_count.sum())
+    means = results.step_sum[:, first_step:, column].sum(axis=0) / runs
+    low, high = band(dof, runs)
+    return float(np.mean((means >= low) & (means <= high)))
+
+
 def window_ratio(
     results: FilterResults, column: int, window: tuple[int, int], against: tuple[int, int]
 ) -> tuple[float, float]:
@@ -127,6 +166,17 @@ def summarise_metric(metric: dict[str, Any], results: FilterResults, column: int
                 value, se = float(np.mean(values)), std / math.sqrt(n)
             case "std":
                 value, se = std, standard_error_of_std(values) if n > 1 else math.nan
+            case "var":
+                error = standard_error_of_std(values) if n > 1 else math.nan
+                value, se = std**2, 2.0 * std * error  # to first order
+            case "max":
+                value = float(values.max())
+            case "pooled":
+                value, se = pooled_over_runs(values)
+            case "peak":
+                value, se = peak_over_steps(results, column, first_step)
+            case "band":
+                value = share_in_band(results, column, first_step, metric["dof"])
             case _:
                 value, se = rms_over_runs(results, column, first_step)
     numbers = {"value": value, "se": se, "std": std, "median": median}

@@ -7,6 +7,7 @@ from emt.scenarios import (
     coordinated_turns,
     course,
     recorded,
+    state_space,
     stationary,
     trajectory,
 )
@@ -18,6 +19,7 @@ __all__ = [
     "coordinated_turns",
     "course",
     "recorded",
+    "state_space",
     "stationary",
     "trajectory",
 ]

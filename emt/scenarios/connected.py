@@ -143,7 +143,7 @@ def build(settings: ConnectedScenarioSettings, runs: int):
         jnp.array([[a.center, a.amplitude, a.rate, a.phase] for a in angles]).reshape(-1, 4),
         noise_root(settings.noise_cov),
         jnp.array([chosen[name] if chosen else 1.0 / n_parts for name in names]),
-        jnp.array(settings.markov.matrix(n_parts)) if settings.markov else None,
+        jnp.array(settings.markov.matrix(names)) if settings.markov else None,
         jnp.array([clutter.probability, *clutter.low, *clutter.high]) if clutter else None,
         plan,
     )

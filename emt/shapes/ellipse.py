@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from emt.linalg import Mat2, Sym2, Vec2
-from emt.types import Articulated, Ellipse, Scalar, StarConvex
+from emt.types import Articulated, Ellipse, Point, Scalar, StarConvex
 
 
 def extent_matrix(ellipse: Ellipse) -> Sym2:
@@ -18,22 +18,22 @@ def major_orientation(ellipse: Ellipse) -> Scalar:
     return ellipse.orientation + jnp.where(swapped, 0.5 * jnp.pi, 0.0)
 
 
-def equivalent_ellipse(shape: Ellipse | StarConvex | Articulated) -> tuple[Float[Array, "2"], Ellipse]:
+def equivalent_ellipse(shape: Ellipse | StarConvex | Articulated | Point) -> tuple[Float[Array, "2"], Ellipse]:
     """The ellipse with the area centroid and second moments of the shape.
 
     Returns:
         offset of its centre from the object's position (m), and the ellipse.
 
     Raises:
-        TypeError: no ellipse stands for a connected object.
+        TypeError: no ellipse stands for a connected object or for a point.
 
     For an outline r(φ): area ½∮r², centroid ⅓∮r³u / area, second moment ¼∮r⁴uuᵀ / area; an ellipse of squared
     semi-axes l² has second moment l²/4.
     """
     if isinstance(shape, Ellipse):
         return jnp.zeros_like(shape.semi_axes), shape
-    if isinstance(shape, Articulated):
-        raise TypeError("no ellipse stands for a connected object")
+    if isinstance(shape, Articulated | Point):
+        raise TypeError("no ellipse stands for a connected object or for a point")
     n = shape.radii.shape[0]
     angles = jnp.arange(n, dtype=shape.radii.dtype) * (2.0 * jnp.pi / n)
     step = 2.0 * jnp.pi / n

@@ -60,7 +60,7 @@ def shares_of(metric: Metric, values: jax.Array, rows: jax.Array, sound: jax.Arr
 
     For a mean it is the value of the run. For a root mean square over runs, averaged over steps, it is the first-order
     share mean_k (√m_k + (e²_k - m_k) / 2√m_k), with m_k the mean square at step k: shares average to the value exactly
-    and spread as the value does.
+    and spread as the value does. For one over runs and steps it is the same with the mean squares of runs.
     """
     used = jnp.maximum(sound.sum(dtype=rows.dtype), 1.0)
     rows = jnp.where(sound[:, None], rows, 0.0)
@@ -68,6 +68,10 @@ def shares_of(metric: Metric, values: jax.Array, rows: jax.Array, sound: jax.Arr
         root = jnp.sqrt(rows.sum(axis=0) / used)
         safe = jnp.where(root > 0.0, root, 1.0)
         return jnp.where(sound, (0.5 * root[None, :] + 0.5 * rows / safe[None, :]).mean(axis=1), 0.0)
+    if metric.over_runs == "pooled":
+        squares = jnp.where(sound, values * values, 0.0)
+        root = jnp.sqrt(squares.sum() / used)
+        return jnp.where(sound, 0.5 * root + 0.5 * squares / jnp.where(root > 0.0, root, 1.0), 0.0)
     return jnp.where(sound, values, 0.0)
 
 

@@ -5,9 +5,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
+from emt.averaging import OF_SINGLE_RUNS
 from emt.config.errors import COMMAND_LINE, ConfigError, Problem
 from emt.config.load import Loaded
-from emt.metrics.base import Metric, find_metric
+from emt.metrics.base import Metric
 from emt.registry import UnknownName
 from emt.tuning.gradient import Descent, Point
 from emt.tuning.parameters import Parameter, candidate, combinations, rounded
@@ -88,10 +89,10 @@ def plan_of(loaded: Loaded, method: Method, objective: str | None, **numbers: An
         ConfigError: the objective is unknown, cannot be tuned for, or needs a truth that is not there.
     """
     try:
-        named = [find_metric(name) for name in ([objective] if objective else loaded.experiment.metrics)]
+        named = [loaded.experiment.metric(n) for n in ([objective] if objective else loaded.experiment.metrics)]
     except UnknownName as error:
         raise refused(str(error)) from None
-    usable = [metric for metric in named if metric.better != "neither" and metric.over_runs != "std"]
+    usable = [metric for metric in named if metric.better != "neither" and metric.over_runs in OF_SINGLE_RUNS]
     if not usable:
         text = f"'{objective}' has no better or worse value of a single run" if objective else "no metric to tune for"
         raise refused(f"{text}; choose for instance gw, iou, position_rmse or nll")
@@ -99,7 +100,7 @@ def plan_of(loaded: Loaded, method: Method, objective: str | None, **numbers: An
     has_truth = loaded.experiment.scenario.has_truth
     if not has_truth and loaded.experiment.reference == "truth" and chosen.name != "nll":
         raise refused("a recording without truth can only be tuned for nll, or against a reference filter")
-    followed = find_metric(chosen.smooth) if method == "gradient" and chosen.smooth else chosen
+    followed = loaded.experiment.metric(chosen.smooth) if method == "gradient" and chosen.smooth else chosen
     if not has_truth:
         numbers |= {"tuning_runs": 1, "reporting_runs": 1}
     return Plan(method, chosen, followed, **numbers)
@@ -140,7 +141,7 @@ def search(
     trials = [build_trial(one.experiment, label) for one in both]
     comparisons = compared(batch, trials, "tuning")
     on_progress(f"scoring the answer on {plan.reporting_runs} other runs")
-    shown = [m for m in map(find_metric, loaded.experiment.metrics) if m.over_runs != "std"]
+    shown = [m for m in map(loaded.experiment.metric, loaded.experiment.metrics) if m.over_runs in OF_SINGLE_RUNS]
     shown = [m for m in dict.fromkeys((*wanted, *shown)) if label not in batch.program.without(m)]
     comparisons += compared(Batch(loaded, label, shown, 0, plan.reporting_runs), trials, "reporting")
     return Outcome(

@@ -66,7 +66,7 @@ MISTAKES = [
     ("  - shape_distance", "  - iou", "no filter of this experiment has 'iou'"),
     ("  - shape_distance", "  - beta_error", "no filter of this experiment has 'beta_error'"),
     ("    length_a_error: 0.5", "    gw: 0.5", "divergence.final_mean_above.gw: is not among the metrics"),
-    ("start_with:", "reference: weighted\nstart_with:", "connected objects are compared with the truth only"),
+    ("start_with:", "reference: weighted\nstart_with:", "a connected object is compared with the truth only"),
     ("  noise_cov: {diagonal: [1.0e-2, 1.0e-2]}\n  prior", "  noise_cov: {diagonal: [1, 2]}\n  prior", "not isotropic"),
     ("kind: connected\n  shape: *object", "kind: conected\n  shape: *object", "model"),
     ("variance: {length: 1.0e-3", "variance: {length: 0", "must be positive for every entry"),
@@ -92,7 +92,7 @@ def test_an_ellipse_filter_does_not_take_a_connected_object(tmp_path, capsys):
     config.write_text(text.replace("final_mean_above:", "position_error_above: 3.0\n  final_mean_above:", 1))
     outcome = emt(capsys, "run", config, "--out", tmp_path / "out")
     assert outcome.code == 2
-    assert "are those of an ellipse" in outcome.err
+    assert "divergence.position_error_above: this object has no position" in outcome.err
 
 
 def test_smoke_scale_has_fewer_steps():

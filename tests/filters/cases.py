@@ -430,5 +430,7 @@ CASES = [
 MAIN = [case for case in CASES if case.label in ("vb_random_matrix", "mem_ekf_star", "feldmann", "gp_ett")]
 """One row per filter."""
 
-ELSEWHERE = {"sampled_posterior", "moment_ukf", "lan_li", "imm", "shape_mixture"}
+POINTS = {"kalman", "ekf", "ukf", "particle", "multiple_model", "likely_model_set", "model_group_switching"}
+"""Filters of points."""
+ELSEWHERE = {"sampled_posterior", "moment_ukf", "lan_li", "imm", "shape_mixture", *POINTS}
 """Filters with files of tests of their own."""

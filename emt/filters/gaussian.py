@@ -1,0 +1,115 @@
+"""Gaussian beliefs about the state of a point: prediction, conditioning on a measurement, mixing."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from emt.linalg import cholesky, forward_solve
+from emt.models.state_space.measurements import Measurement
+from emt.models.state_space.motions import Motion
+from emt.types import Scalar
+
+GROSS_NIS = 100.0
+"""A normalised innovation squared above this sets `Status.GROSS_INNOVATION`: ten standard deviations."""
+
+
+class Belief(NamedTuple):
+    """Mean and covariance of a state."""
+
+    mean: Float[Array, "n"]
+    cov: Float[Array, "n n"]
+
+
+class Innovation(NamedTuple):
+    """What a measurement says of a prediction."""
+
+    log_likelihood: Scalar
+    nis: Scalar
+    """Normalised innovation squared."""
+
+
+class Prediction(NamedTuple):
+    """A predicted belief and, of a sigma-point filter, the points that stand for it."""
+
+    belief: Belief
+    points: Float[Array, "n_points n"] | None = None
+
+
+class Kernel(NamedTuple):
+    """How a Gaussian belief is predicted and conditioned, whatever the approximation."""
+
+    start: Callable[[Belief], Prediction]
+    """A prior as the prediction for a first scan."""
+    predict: Callable[[Belief, Scalar, Scalar], Prediction]
+    """(belief, time, seconds since the last step) -> prediction for that time."""
+    update: Callable[[Prediction, Float[Array, "m"], Scalar], tuple[Belief, Innovation]]
+    """(prediction, measurement, its time) -> belief and innovation."""
+
+
+def predicted(belief: Belief, motion: Motion, noise_cov: Float[Array, "n n"], time: Scalar, dt: Scalar) -> Belief:
+    """Kalman prediction to `time`, `dt` seconds later: exact for a linear motion, else linearised at the mean.
+
+    Source: Azimian 2005, eqs. 1.10 and 2.6; F P Fᵀ + Q in this order is symmetric but for rounding, so it is made so.
+    """
+    mean, jacobian = motion.linearised(belief.mean, time, dt)
+    return Belief(mean, symmetric(jacobian @ belief.cov @ jacobian.T + noise_cov))
+
+
+def symmetric(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """(M + Mᵀ) / 2."""
+    return 0.5 * (matrix + matrix.T)
+
+
+def updated(
+    belief: Belief, measurement: Measurement, noise_cov: Float[Array, "m m"], value: Float[Array, "m"], time: Scalar
+) -> tuple[Belief, Innovation]:
+    """Kalman update with a measurement: exact for a linear one, else linearised at the predicted mean.
+
+    Source: Azimian 2005, eqs. 1.11 and 2.7.
+    """
+    expected, jacobian = measurement.linearised(belief.mean, time)
+    cross = belief.cov @ jacobian.T
+    return conditioned(belief, cross, jacobian @ cross + noise_cov, measurement.difference(value, expected))
+
+
+def conditioned(
+    belief: Belief,
+    cross: Float[Array, "n m"],
+    innovation_cov: Float[Array, "m m"],
+    innovation: Float[Array, "m"],
+) -> tuple[Belief, Innovation]:
+    """The belief given an innovation ν of covariance S = L Lᵀ whose cross-covariance with the state is C.
+
+    With W = L⁻¹ Cᵀ: mean + Wᵀ L⁻¹ ν and P - Wᵀ W, which is P - K S Kᵀ and symmetric to the last bit if P is.
+    """
+    root = cholesky(innovation_cov)
+    gain, white = forward_solve(root, cross.T), forward_solve(root, innovation)
+    nis = (white * white).sum()
+    log_likelihood = -0.5 * (nis + len(innovation) * math.log(2.0 * math.pi)) - jnp.log(jnp.diagonal(root)).sum()
+    taken = (gain[:, :, None] * gain[:, None, :]).sum(axis=0)
+    return Belief(belief.mean + gain.T @ white, belief.cov - taken), Innovation(log_likelihood, nis)
+
+
+def mixed(weights: Float[Array, "n_from n_to"], beliefs: Belief) -> Belief:
+    """Moments of the mixtures of Gaussians, one per column of weights that sum to 1; beliefs have a leading axis.
+
+    Second moments are taken about the average of all means and P + d dᵀ mixed as one matrix product: what is lost is
+    relative to the spread of the means, not to the distance from the origin.
+    """
+    n = beliefs.mean.shape[1]
+    center = beliefs.mean.mean(axis=0)
+    gaps = beliefs.mean - center[None, :]
+    second = beliefs.cov + gaps[:, :, None] * gaps[:, None, :]
+    moments = weights.T @ jnp.concatenate([gaps, second.reshape(-1, n * n)], axis=1)
+    shift = moments[:, :n]
+    cov = moments[:, n:].reshape(-1, n, n) - shift[:, :, None] * shift[:, None, :]
+    return Belief(center[None, :] + shift, 0.5 * (cov + cov.transpose(0, 2, 1)))
+
+
+def fused(weights: Float[Array, "n_modes"], beliefs: Belief) -> Belief:
+    """Moments of one mixture."""
+    both = mixed(weights[:, None], beliefs)
+    return Belief(both.mean[0], both.cov[0])

@@ -14,18 +14,25 @@ from emt.config.load import Loaded, problem_at
 from emt.device import configure, environment
 from emt.montecarlo.chunks import Engine, without_tracks
 from emt.montecarlo.program import Program
+from emt.montecarlo.run import mode_names
 from emt.reports.connected_art import animation, is_connected
 from emt.reports.estimates import estimates_table
 from emt.reports.figures import over_time_figure, replay_figure, track_figure
+from emt.reports.modes_art import modes_figure
+from emt.reports.paper import TIMING_FILE
 from emt.reports.published import summary_table
 from emt.reports.replay import overview_table, steps_table
-from emt.reports.summary import SUMMARY_FILE, curves, summarise
+from emt.reports.summary import SUMMARY_FILE, curves, mode_shares, summarise
 from emt.reports.table import Table
 from emt.scenarios.data import DataError
 from emt.status import FAILURE
 from emt.store import RunFolder
 
 TRACK_FIGURE = "track.png"
+FEWEST_MODES = 3
+"""Of the filter with most, for a figure of mode probabilities; those of two modes fit among the metrics."""
+SHORT_SECONDS = 3.0
+"""Experiments that take less are computed again for the record of costs."""
 
 
 class Progress(NamedTuple):
@@ -106,6 +113,15 @@ def metric_facts(program: Program) -> list[dict[str, Any]]:
     ]
 
 
+def modes_of(program: Program) -> dict[str, list[str]]:
+    """Names of the modes of each filter that has some."""
+    names = {}
+    for label, params in program.filter_params.items():
+        flt = program.make_filter[label](params, program.world.model)
+        names[label] = mode_names(flt, program.world.prior)
+    return {label: found for label, found in names.items() if found}
+
+
 def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
     """What is recorded with results: the identity they depend on, and what readers need to show them."""
     identity, experiment = loaded.identity(), loaded.experiment
@@ -126,6 +142,8 @@ def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
         "state": program.state_names(),
         "maneuvers": [list(interval) for interval in getattr(experiment.scenario, "maneuvers", ())],
         "has_truth": experiment.scenario.has_truth,
+        "modes": modes_of(program),
+        "true_modes": getattr(experiment.scenario, "true_modes", None),
     }
 
 
@@ -191,6 +209,11 @@ def run(
             elapsed = time.perf_counter() - began
             tell("running", f"chunk {number}/{len(missing)}", done, (done - present) / elapsed)
             timing["run_seconds"], timing["runs"] = elapsed, done - present
+        if timing and timing["run_seconds"] < SHORT_SECONDS and len(missing) < 3:
+            for _ in range(2):  # the first chunk of a process is slower than the others
+                engine.run_chunk(*missing[0])
+        if timing:
+            timing["microseconds_per_run_and_step"] = engine.costs()
         tell("reporting", "tables and figures", done)
         if figures and not first_run and not (folder.path / TRACK_FIGURE).exists():
             engine.compile()
@@ -199,7 +222,7 @@ def run(
         if figures:
             write_figures(folder, first_run)
         if timing:
-            folder.write_json("timing.json", timing)
+            folder.write_json(TIMING_FILE, timing)
         tell("done", "", done)
     return summary
 
@@ -223,9 +246,17 @@ def write_figures(folder: RunFolder, first_run: dict[str, np.ndarray]) -> None:
         scored = {label: curves(folder, label) for label in labels}
         over_time = over_time_figure(scored, metrics, unit, maneuvers=manifest["maneuvers"])
         folder.write_bytes("over_time.png", over_time)
+    heading = manifest["title"] or manifest["identity"]["experiment"]
+    is_random = manifest["identity"]["config"]["scenario"].get("switching") is not None  # no two runs are alike
+    if not is_random and any(len(names) >= FEWEST_MODES for names in manifest["modes"].values()):
+        found = {label: mode_shares(folder, label) for label in labels if label in manifest["modes"]}
+        shares = {label: (manifest["modes"][label], share.T) for label, share in found.items() if share is not None}
+        if shares:
+            folder.write_bytes("modes.png", modes_figure(shares, manifest["true_modes"], heading))
     if first_run:
-        title = f"{manifest['title'] or manifest['identity']['experiment']}: run 0"
-        folder.write_bytes(TRACK_FIGURE, track_figure(first_run, labels, length_unit=unit, title=title))
+        about = {"state": manifest["state"], "maneuvers": manifest["maneuvers"]}
+        track = track_figure(first_run, labels, length_unit=unit, title=f"{heading}: run 0", **about)
+        folder.write_bytes(TRACK_FIGURE, track)
         if is_connected(first_run):
             folder.write_bytes("animation.gif", animation(first_run, labels, title=labels[0]))
 
@@ -258,6 +289,8 @@ def replay(loaded: Loaded, run: int) -> Replay:
     metrics = metric_facts(program)
     labels, unit = list(loaded.experiment.filters), loaded.experiment.length_unit
     title = f"{loaded.experiment.title or loaded.name}: run {run}"
-    figure = replay_figure(arrays, labels, metrics, length_unit=unit, title=title)
+    maneuvers = getattr(loaded.experiment.scenario, "maneuvers", ())
+    about = {"state": program.state_names(), "maneuvers": maneuvers}
+    figure = replay_figure(arrays, labels, metrics, length_unit=unit, title=title, **about)
     overview = overview_table(arrays, labels, metrics, title, unit)
     return Replay(figure, steps_table(arrays, labels, metrics, program.state_names()), overview)

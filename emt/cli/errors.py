@@ -3,10 +3,13 @@
 import sys
 import tempfile
 import traceback
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import typer
+
+from emt.config.warning import ConfigWarning
 
 # typer carries its own copy of click, or uses an installed one, depending on its version
 UsageError: type[Exception] = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
@@ -42,8 +45,21 @@ def expected_errors() -> tuple[type[Exception], ...]:
     return tuple(found)
 
 
+def show_warning(message: Warning | str, category: type[Warning], *where: object) -> None:
+    """A warning as a message to the user."""
+    say(f"warning: {message}")
+
+
 def run_app(app: Callable[..., object], debug: bool) -> int:
     """Runs the command line and turns whatever ends it into messages and an exit code."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", ConfigWarning)
+        warnings.showwarning = show_warning
+        return finished(app, debug)
+
+
+def finished(app: Callable[..., object], debug: bool) -> int:
+    """Exit code of the command line."""
     try:
         result = app(standalone_mode=False)
         return result if isinstance(result, int) else 0

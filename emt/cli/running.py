@@ -164,14 +164,17 @@ def find_recordings(loaded, places: list[Path]) -> dict[str, Path]:
 def table(
     folder: Annotated[Path, typer.Argument(help="A folder written by `emt run` or `emt reproduce`.")],
     format: Annotated[TableFormat, typer.Option("--format", "-f", help="Format.")] = TableFormat.text,
+    over_time: Annotated[bool, typer.Option("--over-time", help="Every metric at every scan, instead.")] = False,
 ) -> None:
     """Print the table of a finished experiment; with published numbers beside it where there are any.
 
     Example: emt table results/tuncer2021/trajectory_uniform --format latex
     """
+    from emt.reports.over_time import curves_table
     from emt.reports.paper import folder_tables
+    from emt.store import read_folder
 
-    for part in folder_tables(folder):
+    for part in [curves_table(read_folder(folder))] if over_time else folder_tables(folder):
         typer.echo(part.render(format.value), nl=format.value in ("text", "markdown"))
 
 

@@ -177,6 +177,8 @@ class Experiment(Settings):
     """How root-mean-square errors (`position_rmse`, `velocity_rmse`) average over steps: "per_step", root over runs at
     each step, then the mean over steps; or "pooled", one root of the mean over runs and steps."""
     metrics: tuple[MetricName, ...] = ("gw", "iou", "position_rmse", "velocity_rmse", "nees")
+    segments: dict[Label, tuple[PositiveInt, PositiveInt]] = Field(default_factory=dict)
+    """First and last scan (from 1) of stretches of time on which root-mean-square errors are shown apart."""
     skip_steps: NonNegativeInt = 0
     """Steps at the start that do not count in the averages over time."""
     divergence: Divergence | None = None

@@ -2,6 +2,7 @@
 
 import copy
 import sys
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from emt.config.experiment import Experiment, model_for
 from emt.config.overrides import apply_overrides
 from emt.config.shipped import SHIPPED, config_names, config_path
 from emt.config.source import Source, load_source
+from emt.config.warning import ConfigWarning
 from emt.registry import PluginError, UnknownName, suggest
 
 NOT_RESULTS = ("name", "paper", "title", "length_unit", "sources")
@@ -124,6 +126,8 @@ def check(source: Source, path: Path) -> Experiment:
     problems = list(contradictions(experiment, source))
     if problems:
         raise ConfigError(problems)
+    for problem in oddities(experiment, source):
+        warnings.warn(str(problem), ConfigWarning, stacklevel=3)
     return experiment
 
 
@@ -176,11 +180,23 @@ def contradictions(experiment: Experiment, source: Source) -> Iterable[Problem]:
     if n_steps is not None and experiment.skip_steps >= n_steps:
         message = f"must be less than the {n_steps} steps of the scenario, got {experiment.skip_steps}"
         yield problem_at(source, ("skip_steps",), message)
+    for name, (first, last) in experiment.segments.items():
+        if not first <= last <= (n_steps or last):
+            message = f"must be a first and a last scan of the {n_steps} of the scenario, got {first} and {last}"
+            yield problem_at(source, ("segments", name), message)
     resolved = experiment.model_dump(mode="json")
     for group, keys in experiment.sources:
         for k, key in enumerate(keys):
             if not has_key(resolved, key.split(".")):
                 yield problem_at(source, ("sources", group, k), f"'{key}' is not a setting of this file")
+
+
+def oddities(experiment: Experiment, source: Source) -> Iterable[Problem]:
+    """What can be used, but is probably not meant."""
+    model = experiment.model
+    for name in getattr(model, "unreachable", ()):
+        message = "cannot be reached: the point neither starts in it nor switches to it, so its probability stays 0"
+        yield problem_at(source, ("model", "motions", name), message)
 
 
 def mismatches(experiment: Experiment, source: Source) -> Iterable[Problem]:

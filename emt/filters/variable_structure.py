@@ -2,6 +2,8 @@
 
 The belief of a motion depends on which motions ran in the step before, not on which run now. All motions are therefore
 computed, and sets are masks on probabilities: enlarging a set after the measurement is a second normalisation.
+Computing only the motions that may be needed, gathered into slots, is no faster in batches: 11 slots for 13 motions
+cost as much as all 13, and sets of 12 occur.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """Many runs: chunks of fixed size, from run numbers to the arrays that are stored."""
 
 import itertools
+import statistics
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -9,11 +11,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from emt.models.state_space.measurements import Measurement
 from emt.montecarlo.fields import truth_fields
 from emt.montecarlo.program import Program, Simulation
 from emt.montecarlo.run import Scores, as_truth
 from emt.status import FAILURE
+from emt.types import Measurements
 
 WORKERS = 2
 """Chunks in work at a time."""
@@ -30,15 +35,19 @@ def score_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
     """What is stored of one filter's scores of the first `n` runs of a chunk.
 
     `values` (run, metric), `status`, `failed_step` and `nis`, its mean over steps (run); over the runs without
-    failure, per block of runs, `step_sum` (block, step, metric) and `step_count` (block); and `step_squares`
-    (step, metric).
+    failure, per block of runs, `step_sum` (block, step, metric) and `step_count` (block), and over all of them
+    `step_squares` (step, metric) and, of a filter with modes, the sum `mode_sum` (step, mode) of their probabilities.
     """
     rows, status = np.asarray(scores.per_step)[:n].astype(np.float64), np.asarray(scores.status)[:n]
     sound = (status & int(FAILURE)) == 0
     kept = np.where(sound[:, None, None], rows, 0.0)
     edges = np.linspace(0, n, BLOCKS + 1).astype(int)
     blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
-    return {
+    modes, sums = scores.track.modes, {}
+    if modes is not None:
+        probability = np.asarray(modes)[:n].astype(np.float64)
+        sums[f"{label}/mode_sum"] = np.where(sound[:, None, None], probability, 0.0).sum(axis=0)
+    return sums | {
         f"{label}/values": np.asarray(scores.values)[:n].astype(np.float64),
         f"{label}/status": status.astype(np.int32),
         f"{label}/failed_step": np.asarray(scores.failed_step)[:n].astype(np.int32),
@@ -56,13 +65,29 @@ def track_arrays(label: str, scores: Scores, n: int) -> dict[str, np.ndarray]:
     return {f"{label}/track/{name}": np.asarray(value)[:n] for name, value in fields.items() if value is not None}
 
 
-def scan_arrays(simulation: Simulation, has_truth: bool, n: int) -> dict[str, np.ndarray]:
+def scan_places(measurement: Measurement, scans: Measurements) -> Float[Array, "run step 2"] | None:
+    """Where in the plane the measurements say that a point is (m); NaN without a measurement, None if they do not say.
+
+    Args:
+        measurement: what is measured of the point.
+        scans: with leading axes run and step.
+    """
+    places = jax.vmap(jax.vmap(lambda points: measurement.place(points[0])))(scans.points)
+    return None if places is None else jnp.where(scans.mask, places, jnp.nan)
+
+
+def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, np.ndarray]:
     """Scans, and the truth where there is one, of the first `n` runs of a chunk."""
+    simulation = jax.tree.map(lambda leaf: leaf[:n], simulation)
     arrays = {"scans/points": simulation.scans.points, "scans/mask": simulation.scans.mask}
-    if has_truth:
-        drawn = jax.vmap(jax.vmap(truth_fields))(jax.tree.map(lambda leaf: leaf[:n], simulation.truth))
+    measurement = getattr(program.world.scenario, "measurement", None)
+    if isinstance(measurement, Measurement):
+        places = scan_places(measurement, simulation.scans)
+        arrays |= {} if places is None else {"scans/places": places}
+    if program.experiment.scenario.has_truth:
+        drawn = jax.vmap(jax.vmap(truth_fields))(simulation.truth)
         arrays |= {f"truth/{name}": value for name, value in drawn.items()}
-    return {name: np.asarray(value)[:n] for name, value in arrays.items()}
+    return {name: np.asarray(value) for name, value in arrays.items()}
 
 
 class Engine:
@@ -71,6 +96,8 @@ class Engine:
     def __init__(self, program: Program, seed: int, chunk_size: int):
         self.program, self.seed, self.chunk_size = program, jnp.asarray(seed), chunk_size
         self._compiled: dict[str, Any] = {}
+        self.seconds: dict[str, list[float]] = {label: [] for label in program.filter_params}
+        """Wall-clock time of filter and metrics of each chunk so far, by filter."""
 
     def labels(self) -> list[str]:
         """Filters in the order of computation: a reference filter first."""
@@ -96,6 +123,14 @@ class Engine:
         with ThreadPoolExecutor(WORKERS) as pool:
             self._compiled = dict(zip(names, pool.map(build, names), strict=True))
 
+    def costs(self) -> dict[str, float]:
+        """Microseconds per run and step of each filter with its metrics: the median over chunks.
+
+        Two chunks are in work at a time, so it is what a run costs in company, not alone.
+        """
+        lanes = self.chunk_size * self.program.n_steps
+        return {label: 1e6 * statistics.median(found) / lanes for label, found in self.seconds.items() if found}
+
     def run_chunk(self, start: int, stop: int, *, tracked: int = 0) -> dict[str, np.ndarray]:
         """Arrays of the runs `start` to `stop - 1`, by name; with every report and scan of the first `tracked` runs.
 
@@ -109,14 +144,17 @@ class Engine:
         tracked = n if experiment.traces else min(tracked, n)
         for label in self.labels():
             params = program.filter_params[label]
-            scores = self._compiled[label](world, params, self.seed, runs, simulation.scans, target)
+            started = time.perf_counter()
+            arguments = (world, params, self.seed, runs, simulation.scans, target)
+            scores = jax.block_until_ready(self._compiled[label](*arguments))
+            self.seconds[label].append(time.perf_counter() - started)
             if label == experiment.reference:
                 target = jax.vmap(as_truth)(scores.track)
             arrays |= score_arrays(label, scores, n)
             if tracked:
                 arrays |= track_arrays(label, scores, tracked)
         if tracked:
-            arrays |= scan_arrays(simulation, experiment.scenario.has_truth, tracked)
+            arrays |= scan_arrays(program, simulation, tracked)
         return arrays
 
     def run_chunks(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:

@@ -27,6 +27,8 @@ class Track(NamedTuple):
     status: Int[Array, "n_steps"]
     cov: Float[Array, "n_steps n n"] | None
     """Covariance of the mean, on request."""
+    modes: Float[Array, "n_steps n_modes"] | None
+    """Probability of each motion mode in the order of `mode_names`, for multiple-model filters."""
 
 
 class Scores(NamedTuple):
@@ -65,7 +67,19 @@ def advance(
 def report(estimate: Estimate, info: Info, status: Int[Array, ""], full: bool) -> Track:
     """One step of a track."""
     shape = estimate_fields(estimate, full)
-    return Track(estimate.mean, shape, info.nis, status, estimate.cov if full else None)
+    modes = jnp.stack(list(estimate.modes.values())) if estimate.modes else None
+    return Track(estimate.mean, shape, info.nis, status, estimate.cov if full else None, modes)
+
+
+def mode_names(flt: Filter, prior: Prior | StatePrior) -> list[str]:
+    """Names of a filter's modes in the order of its reports; none if it has none."""
+    names: list[str] = []
+
+    def look():
+        names.extend(flt.estimate(flt.init(prior, jax.random.key(0))).modes or ())
+
+    jax.eval_shape(look)  # what it returns would have the names sorted
+    return names
 
 
 def as_truth(track: Track) -> Truth:

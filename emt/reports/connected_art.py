@@ -53,7 +53,7 @@ class Movie(NamedTuple):
 
 def is_connected(arrays: Mapping[str, np.ndarray]) -> bool:
     """Whether the arrays of a run are those of a connected object."""
-    return "truth/state" in arrays
+    return any(f"truth/{name}" in arrays for name in ("starts", "bodies", "discs"))
 
 
 def movie_of(arrays: Mapping[str, np.ndarray], labels: Sequence[str], run: int) -> Movie:

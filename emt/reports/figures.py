@@ -14,8 +14,9 @@ from matplotlib.patches import Patch
 
 from emt.reports.connected_art import connected_legend, draw_snapshots, is_connected, movie_of
 from emt.reports.ellipse_art import scene_of
-from emt.reports.plot_style import MANEUVER, fixed_look, legend_below, new_figure, plain, png, styles_of
+from emt.reports.plot_style import BAND, MANEUVER, fixed_look, legend_below, new_figure, plain, png, styles_of
 from emt.reports.series_art import (
+    BANDED,
     chosen_metrics,
     draw_curves,
     draw_run,
@@ -24,6 +25,7 @@ from emt.reports.series_art import (
     grid,
     run_series,
 )
+from emt.reports.state_art import draw_flight, flight_legend, flight_of, flight_size, is_state_space
 from emt.reports.summary import Curve
 from emt.reports.track_art import draw_track, track_legend, track_size
 
@@ -39,8 +41,12 @@ def track_figure(
     run_index: int = 0,
     length_unit: str = "m",
     title: str = "",
+    state: Sequence[str] = (),
+    maneuvers: Sequence[Sequence[float]] = (),
 ) -> bytes:
     """The path, scans and outlines of one run, with close-ups where the object turns.
+
+    Of a point, its path with close-ups where filters differ, or its state over time.
 
     Args:
         arrays: tracks and scans of a chunk by name, e.g. `vb/track/center` (run, step, 2); with
@@ -49,12 +55,21 @@ def track_figure(
         run_index: row of the arrays.
         length_unit: unit of the axes.
         title: heading.
+        state: names of the entries of the state of a point.
+        maneuvers: first and last scan number of each true manoeuvre of a point.
 
     Returns:
         A PNG.
     """
     with fixed_look():
         styles = styles_of(labels)
+        if is_state_space(arrays):
+            flight = flight_of(arrays, labels, run_index, state, maneuvers)
+            figure = new_figure(*flight_size(flight))
+            draw_flight(figure, flight, styles, length_unit, {})
+            legend_below(figure, *flight_legend(flight, styles))
+            figure.suptitle(plain(title))
+            return png(figure)
         if is_connected(arrays):
             figure = new_figure(9.6, 5.6)
             draw_snapshots(figure, movie_of(arrays, labels, run_index), styles, length_unit, 2, 4)
@@ -81,6 +96,8 @@ def over_time_figure(
 ) -> bytes:
     """Metrics over time: mean over runs, its 95 % interval, and one standard deviation over runs.
 
+    NEES and NIS come with the chi-square band of a consistent filter. Curves far apart share a logarithmic axis.
+
     Args:
         curves: curves by filter and metric; the order of filters fixes their colours, so give one without
             curves an empty place. Of a metric whose `over_time` is "rms" the curve is of the squared error;
@@ -99,6 +116,8 @@ def over_time_figure(
         styles = styles_of(list(curves))
         n_steps = max((len(curve.mean) for c in curves.values() for curve in c.values()), default=0)
         width = SMOOTHED_SCANS if n_steps >= LONG else 1
+        if width > 1:
+            metrics = [{**metric, "dof": None} for metric in metrics]  # moving averages have narrower bands
         curves = {label: {name: smoothed(c, width) for name, c in named.items()} for label, named in curves.items()}
         told = [m for m in metrics if any(m["name"] in c and c[m["name"]].mean.any() for c in curves.values())]
         chosen = chosen_metrics(told, max_panels)  # nothing but zeros needs no panel
@@ -131,6 +150,9 @@ def over_time_figure(
         if maneuvers:
             handles.append(Patch(color=MANEUVER))
             names.append("true manoeuvre")
+        if any(metric["name"] in BANDED and metric.get("dof") for metric in chosen):
+            handles.append(Patch(color=BAND))
+            names.append("95 % band")
         legend_below(figure, handles, names)
         counted = _count_text(list(runs.values())) + (f"; averaged over {width} {dt_label}s" if width > 1 else "")
         figure.suptitle(plain(f"{title} – {counted}" if title else counted))
@@ -146,6 +168,8 @@ def replay_figure(
     title: str = "",
     dt_label: str = "scan",
     max_panels: int = 4,
+    state: Sequence[str] = (),
+    maneuvers: Sequence[Sequence[float]] = (),
 ) -> bytes:
     """One run in detail: its track on the left, its scores scan by scan on the right.
 
@@ -161,6 +185,7 @@ def replay_figure(
         title: heading.
         dt_label: what a step is called.
         max_panels: at most so many panels on the right.
+        state, maneuvers: as for `track_figure`.
 
     Returns:
         A PNG.
@@ -171,7 +196,11 @@ def replay_figure(
         failures = {label: failures_of(arrays, label, run_index) for label in labels}
         figure = new_figure(12.0, 6.6)
         left, right = np.ravel(figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1.0)))
-        if is_connected(arrays):
+        if is_state_space(arrays):
+            flight = flight_of(arrays, labels, run_index, state, maneuvers)
+            draw_flight(left, flight, styles, length_unit, failures)
+            legend = flight_legend(flight, styles)
+        elif is_connected(arrays):
             draw_snapshots(left, movie_of(arrays, labels, run_index), styles, length_unit, 3, 2)
             legend = connected_legend(styles)
         else:
@@ -207,7 +236,7 @@ def _count_text(runs: Sequence[int]) -> str:
     low, high = min(runs, default=0), max(runs, default=0)
     counted = f"{high}" if low == high else f"{low} to {high}"
     runs_word = "run" if high == 1 else "runs"
-    return f"mean over {counted} {runs_word}, its 95 % interval, and one standard deviation (light; not for RMS)"
+    return f"mean over {counted} {runs_word} with its 95 % interval; light: one standard deviation over runs"
 
 
 def _label_bottom(panels: Sequence[Axes], columns: int, text: str) -> None:

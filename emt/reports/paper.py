@@ -7,13 +7,25 @@ from typing import Any, NamedTuple
 from emt.config.shipped import published_path
 from emt.reports.claims import claims_table
 from emt.reports.estimates import estimates_table
-from emt.reports.published import LEGEND, Published, comparison_table, load_published, median_table, summary_table
+from emt.reports.guide import guide_table
+from emt.reports.published import (
+    LEGEND,
+    LEGEND_END,
+    Origin,
+    Published,
+    comparison_table,
+    load_published,
+    median_table,
+    summary_table,
+)
+from emt.reports.segments import segments_table
 from emt.reports.summary import SUMMARY_FILE
 from emt.reports.table import Table
 from emt.store import RunReader, StoreError, read_folder
 
-FIGURES = ("track.png", "over_time.png")
+FIGURES = ("track.png", "over_time.png", "modes.png")
 ANIMATION = "animation.gif"
+TIMING_FILE = "timing.json"
 FRAMES = (1, 2, 11, 20, 50, 80, 105)
 """Frames of a recording that a report shows."""
 
@@ -31,7 +43,8 @@ class PaperReport(NamedTuple):
         """The report as Markdown; figures are referred to by `prefix` and their names."""
         lines = [f"# {self.paper}", ""]
         if self.published is not None:
-            legend = LEGEND if self.published.tables else LEGEND[-1:]
+            origins: dict[Origin, None] = dict.fromkeys(table.origin for table in self.published.tables)
+            legend = [*(line for origin in origins for line in LEGEND[origin]), LEGEND_END]
             lines += [self.published.citation, "", *[f"- {line}" for line in legend], ""]
             lines += [f"- `{name}`: {text}" for name, text in self.published.definitions.items()] + [""]
         lines += [part.render("markdown") for part in self.tables]
@@ -61,6 +74,14 @@ def read_summary(reader: RunReader) -> dict[str, Any]:
         ) from error
 
 
+def costs_of(reader: RunReader) -> dict[str, float]:
+    """Microseconds per run and step of each filter, from the last time that runs were computed; none if unknown."""
+    try:
+        return reader.read_json(TIMING_FILE)["microseconds_per_run_and_step"]
+    except (StoreError, KeyError):
+        return {}
+
+
 def published_of(paper: str | None) -> Published | None:
     """The published numbers of a paper, where there are any."""
     path = published_path(paper) if paper else None
@@ -79,6 +100,8 @@ def experiment_tables(reader: RunReader, published: Published | None) -> list[Ta
         if part.experiment == summary["experiment"]
     ]
     tables.append(summary_table(summary, unit))
+    if (stretches := segments_table(summary, unit)) is not None:
+        tables.append(stretches)
     rule = manifest["identity"]["config"]["divergence"]
     return tables if rule is None or rule["exclude"] else [*tables, median_table(summary, unit)]
 
@@ -105,6 +128,11 @@ def paper_report(paper: str, folders: Mapping[str, Path]) -> PaperReport:
         short = name.split("/")[-1]
         wanted = (*FIGURES, ANIMATION) if published and name in published.animations else FIGURES
         figures |= {f"{short}-{figure}": folder / figure for figure in wanted if (folder / figure).is_file()}
+    if published and published.guide:
+        costs = {name: costs_of(reader) for name, reader in readers.items()}
+        units = {name: reader.manifest["length_unit"] for name, reader in readers.items()}
+        guide = guide_table(published.guide, summaries, costs, units)
+        tables += [guide] if guide is not None else []
     if published and published.claims:
         tables.append(claims_table(published.claims, summaries, readers))
     return PaperReport(paper, published, tables, figures)

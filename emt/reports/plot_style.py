@@ -27,7 +27,7 @@ DASHES: tuple[Any, ...] = (
 
 CHARACTERS_PER_INCH = 14.0
 """Of the legend's type."""
-MANEUVER = "#EFE9DC"
+MANEUVER, BAND = "#EFE9DC", "#D9DEE3"
 TRUTH_FILL, TRUTH_EDGE, PATH, POINT = "#D2D2D2", "#8C8C8C", "#707070", "#333333"
 
 RC: dict[str, Any] = {

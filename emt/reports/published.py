@@ -9,18 +9,31 @@ from pydantic import Field, PositiveInt
 from emt.config.errors import validate
 from emt.config.source import load_source
 from emt.reports.claims import Claim
+from emt.reports.guide import Situation
 from emt.reports.numbers import significant, unit_text, value_and_error
 from emt.reports.table import Column, Table
 from emt.settings import Settings
 
-Verdict = Literal["agrees", "close", "differs", "not comparable"]
+Verdict = Literal["agrees", "close", "differs", "not comparable", "not confirmed"]
+Origin = Literal["published", "unconfirmed", "theory", "independent"]
 
-LEGEND = (
-    "agrees: inside our 95 % interval widened by half a unit of the last printed digit.",
-    "close: inside that interval when the published value's own sampling error over its runs is added, "
-    "or within 5 % of it.",
-    "± is our standard error; used: runs without failure / runs.",
-)
+LEGEND: dict[Origin, tuple[str, ...]] = {
+    "published": (
+        "agrees: inside our 95 % interval widened by half a unit of the last printed digit.",
+        "close: inside that interval when the published value's own sampling error over its runs is added, "
+        "or within 5 % of it.",
+    ),
+    "unconfirmed": (
+        "not confirmed: the number is quoted from memory, so it gets no verdict before it has been checked in print.",
+    ),
+    "theory": ("theory: exact values; agrees: inside our 95 % interval; close: within 5 %.",),
+    "independent": (
+        "reference: mean ± standard error of another implementation of the same settings (plain NumPy, other random "
+        "numbers); agrees: within 1.96 combined standard errors; close: within 4, or within 5 %.",
+    ),
+}
+LEGEND_END = "± is our standard error; used: runs without failure / runs."
+Z_AGREES, Z_CLOSE = 1.96, 4.0
 
 
 class Cell(Settings):
@@ -29,7 +42,7 @@ class Cell(Settings):
     filter: str
     metric: str
     value: str
-    """As printed, so that its decimals are known."""
+    """As printed, so that its decimals are known; with its standard error, "1.23 ± 0.04", where that is known."""
     comparable: bool = True
     """False if the definition or the setting behind the number is known to differ from ours."""
 
@@ -41,7 +54,17 @@ class PublishedTable(Settings):
     experiment: str
     runs: PositiveInt
     """Monte Carlo runs behind the printed numbers."""
-    cells: tuple[Cell, ...]
+    origin: Origin = "published"
+    """Where the numbers come from: print; memory of something in print; theory; another implementation."""
+    cells: tuple[Cell, ...] = ()
+    rows: dict[str, dict[str, str]] = Field(default_factory=dict)
+    """The same in short: filter -> metric -> value."""
+
+    @property
+    def all_cells(self) -> tuple[Cell, ...]:
+        """Cells and rows."""
+        short = [Cell(filter=f, metric=m, value=v) for f, row in self.rows.items() for m, v in row.items()]
+        return (*self.cells, *short)
 
 
 class Published(Settings):
@@ -56,6 +79,8 @@ class Published(Settings):
     """Experiments that `emt bench PAPER` times; by default all."""
     animations: tuple[str, ...] = ()
     """Experiments whose animation belongs in the report."""
+    guide: tuple[Situation, ...] = ()
+    """Situations for the table of which filter to use when."""
 
 
 class Comparison(NamedTuple):
@@ -76,6 +101,12 @@ def load_published(path: Path) -> Published:
         ConfigError: the file is not as it should be.
     """
     return validate(Published, load_source(path))
+
+
+def printed_parts(printed: str) -> tuple[str, float | None]:
+    """A value as printed, and its standard error where it is given."""
+    value, _, error = printed.partition("±")
+    return value.strip(), float(error) if error.strip() else None
 
 
 def half_unit(printed: str) -> float:
@@ -100,17 +131,58 @@ def judge(printed: str, published_runs: int, ours: dict[str, Any]) -> Verdict:
     return "differs"
 
 
+def judge_reference(printed: str, reference_runs: int, ours: dict[str, Any]) -> Verdict:
+    """Verdict on a number that another implementation reached, by combined standard errors.
+
+    Where its own is not given, it is taken as ours, scaled by the numbers of runs.
+    """
+    value, (text, error) = ours["value"], printed_parts(printed)
+    if value is None or ours["runs_used"] == 0:
+        return "not comparable"
+    own = ours["se"] or 0.0
+    error = own * math.sqrt(ours["runs_used"] / reference_runs) if error is None else error
+    difference, combined = max(abs(value - float(text)) - half_unit(text), 0.0), math.hypot(own, error)
+    if difference <= Z_AGREES * combined:
+        return "agrees"
+    return "close" if difference <= Z_CLOSE * combined or difference <= 0.05 * abs(float(text)) else "differs"
+
+
+def number_of(summary: dict[str, Any], label: str, metric: str) -> dict[str, Any] | None:
+    """Our number of a filter; `metric[segment]` is that of a stretch of time."""
+    if not metric.endswith("]"):
+        return summary["filters"].get(label, {}).get(metric)
+    name, _, segment = metric[:-1].partition("[")
+    return summary.get("segments", {}).get(label, {}).get(name, {}).get(segment)
+
+
+def verdict_on(table: PublishedTable, cell: Cell, ours: dict[str, Any]) -> Verdict:
+    """Verdict by the origin of the number."""
+    if not cell.comparable:
+        return "not comparable"
+    if table.origin == "unconfirmed":
+        return "not confirmed"
+    return (judge_reference if table.origin == "independent" else judge)(cell.value, table.runs, ours)
+
+
 def compare(table: PublishedTable, summary: dict[str, Any]) -> list[Comparison]:
     """Every cell of a published table beside the summary of our experiment."""
     comparisons = []
-    for cell in table.cells:
-        ours = summary["filters"].get(cell.filter, {}).get(cell.metric)
+    for cell in table.all_cells:
+        ours = number_of(summary, cell.filter, cell.metric)
         if ours is None:
             comparisons.append(Comparison(cell, None, None, "not comparable", 0, summary["runs"]))
             continue
-        verdict = judge(cell.value, table.runs, ours) if cell.comparable else "not comparable"
+        verdict = verdict_on(table, cell, ours)
         comparisons.append(Comparison(cell, ours["value"], ours["se"], verdict, ours["runs_used"], summary["runs"]))
     return comparisons
+
+
+HEADINGS: dict[Origin, str] = {
+    "published": "published",
+    "unconfirmed": "from memory",
+    "theory": "theory",
+    "independent": "reference",
+}
 
 
 def comparison_table(table: PublishedTable, summary: dict[str, Any], length_unit: str) -> Table:
@@ -119,7 +191,7 @@ def comparison_table(table: PublishedTable, summary: dict[str, Any], length_unit
         Column("filter", "filter"),
         Column("metric", "metric"),
         Column("unit", "unit"),
-        Column("published", "published", True),
+        Column("published", HEADINGS[table.origin], True),
         Column("value", "reproduced", True),
         Column("se", "±", True),
         Column("difference", "diff", True),
@@ -129,9 +201,9 @@ def comparison_table(table: PublishedTable, summary: dict[str, Any], length_unit
     units = {metric["name"]: metric["unit"] for metric in summary["metrics"]}
     rows, values = [], []
     for c in compare(table, summary):
-        unit = units.get(c.cell.metric, "")
+        unit = units.get(c.cell.metric.partition("[")[0], "")
         value, error = value_and_error(c.value, c.se)
-        printed = float(c.cell.value)
+        printed = float(printed_parts(c.cell.value)[0])
         difference = "" if c.value is None or printed == 0.0 else f"{100.0 * (c.value / printed - 1.0):+.1f} %"
         rows.append(
             {
@@ -160,7 +232,8 @@ def comparison_table(table: PublishedTable, summary: dict[str, Any], length_unit
                 "runs": c.runs,
             }
         )
-    return Table(f"{table.title} ({table.runs} runs in the paper)", columns, rows, values)
+    origin = {"published": f" ({table.runs} runs in the paper)", "independent": f" ({table.runs} runs there)"}
+    return Table(f"{table.title}{origin.get(table.origin, '')}", columns, rows, values)
 
 
 def summary_table(summary: dict[str, Any], length_unit: str) -> Table:

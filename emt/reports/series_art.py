@@ -5,15 +5,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from emt.averaging import OF_SINGLE_RUNS
+from emt.reports.axis_art import frame, limit, log_axis, needs_log, value_range
 from emt.reports.numbers import unit_text
-from emt.reports.plot_style import LineStyle, plain
-from emt.reports.summary import Curve
+from emt.reports.plot_style import BAND, PATH, LineStyle, plain
+from emt.reports.summary import Curve, band
 from emt.status import FAILURE, Status
 
-PREFERRED = ("gw", "iou", "orientation_rmse_wrapped_deg", "position_rmse")
+PREFERRED = (
+    *("gw", "iou", "orientation_rmse_wrapped_deg", "position_rmse", "velocity_rmse", "run_rmse"),
+    *("nees", "cid", "active_models", "effective_samples"),
+)
 READABLE = {
     "gw": "Gaussian–Wasserstein distance",
     "gw_center_sq": "squared centre distance",
@@ -24,9 +27,21 @@ READABLE = {
     "orientation_rmse_deg": "RMS orientation error, not wrapped",
     "orientation_rmse_wrapped_deg": "RMS orientation error",
     "moments_projected": "fraction of scans with a projection",
-    "nees": "NEES of position and velocity",
+    "nees": "NEES",
+    "nis": "NIS",
+    "run_mse": "squared error",
+    "run_rmse": "RMS error",
+    "cid": "correct mode identification",
+    "iid": "incorrect mode identification",
+    "nid": "no mode identification",
+    "active_models": "filters run per scan",
+    "effective_samples": "effective sample size / particles",
 }
 Z95 = 1.96
+BANDED = ("nees", "nis")
+"""Metrics whose mean over runs has a chi-square band; it tells more than their spread."""
+SHARES = ("cid", "iid", "nid")
+"""Metrics that are 0 or 1 in a single run: their spread over runs says nothing more."""
 
 
 def chosen_metrics(metrics: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
@@ -34,6 +49,8 @@ def chosen_metrics(metrics: Sequence[Mapping[str, Any]], most: int) -> list[Mapp
     usable = [
         m for m in metrics if m["over_runs"] in OF_SINGLE_RUNS and m["over_time"] != "end" and not m.get("counted")
     ]
+    if any(m["name"] == "run_rmse" for m in usable):
+        usable = [m for m in usable if m["name"] != "run_mse"]  # the same curve, squared
     rank = {name: place for place, name in enumerate(PREFERRED)}
     return sorted(usable, key=lambda metric: rank.get(metric["name"], len(rank)))[:most]
 
@@ -57,56 +74,37 @@ def grid(count: int) -> tuple[int, int]:
     return (count, 1) if count <= 3 else ((count + 1) // 2, 2)
 
 
-def bands(curve: Curve, is_root: bool) -> tuple[np.ndarray, np.ndarray | None]:
+def bands(curve: Curve, is_root: bool, is_log: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
     """What is drawn of a curve.
 
     Args:
         curve: mean and spread over runs at every step.
         is_root: the curve is of a squared error and its root is wanted, with that of the interval.
+        is_log: the interval is wanted symmetrical on a logarithmic axis, to first order.
 
     Returns:
         Rows mean, low and high end of the 95 % interval of the mean; and rows low and high end of one
-        standard deviation over runs. The latter is None for a root: squared errors spread as widely as their
-        mean, so the band would always reach zero.
+        standard deviation over runs. The latter is None for a root and on a logarithmic axis: squared errors
+        spread as widely as their mean, so the band would always reach zero.
     """
     mean, std = np.asarray(curve.mean, float), np.asarray(curve.std, float)
     half = Z95 * std / np.sqrt(max(curve.runs, 1))
+    if is_log:
+        factor = np.exp(half / mean)
+        inner = np.stack([mean, mean / factor, mean * factor])
+        return np.sqrt(inner) if is_root else inner, None
     inner = np.stack([mean, mean - half, mean + half])
     return (np.sqrt(np.maximum(inner, 0.0)), None) if is_root else (inner, np.stack([mean - std, mean + std]))
 
 
-def frame(ax: Axes, n_steps: int) -> None:
-    """Grid, open frame, and whole scan numbers."""
-    ax.grid(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    if n_steps > 1:
-        ax.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=[1, 2, 5, 10]))
-        ax.set_xlim(1 - 0.01 * n_steps, n_steps + 0.01 * n_steps)
-
-
-def value_range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Least and greatest finite value; infinite the wrong way round where there is none."""
-    values = np.concatenate([array.ravel() for array in arrays])
-    values = values[np.isfinite(values)]
-    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
-
-
-def limit(ax: Axes, metric: Mapping[str, Any], inner: Sequence[np.ndarray], outer: Sequence[np.ndarray]) -> None:
-    """Limits of the value axis that show all of `inner` and, within reason, of `outer`."""
-    low, high = value_range(inner)
-    wide_low, wide_high = value_range(outer)
-    if not np.isfinite([low, high, wide_low, wide_high]).all():
-        return
-    span = max(high - low, 1e-3 * abs(high), 1e-12)
-    # a heavy tail over runs must not press the curves together
-    bottom, top = max(min(low, wide_low), low - 0.6 * span), min(max(high, wide_high), high + 0.6 * span)
-    bottom, top = bottom - 0.04 * span, top + 0.04 * span
-    if low >= 0.0:
-        bottom = max(bottom, 0.0)
-    if metric["name"] == "iou":
-        top = min(top, 1.0)
-    if bottom < top:
-        ax.set_ylim(bottom, top)
+def draw_band(ax: Axes, metric: Mapping[str, Any], runs: int) -> np.ndarray:
+    """The 95 % band of the mean over so many runs of a normalised square; returns its ends, none for other metrics."""
+    if metric["name"] not in BANDED or not metric.get("dof") or runs < 1:
+        return np.zeros(0)
+    ends = band(metric["dof"], runs)
+    ax.axhspan(*ends, color=BAND, lw=0.0, zorder=0.5)
+    ax.axhline(metric["dof"], color=PATH, lw=0.6, zorder=0.6)
+    return np.array(ends)
 
 
 def empty_panel(ax: Axes, text: str) -> None:
@@ -125,10 +123,15 @@ def draw_curves(
 ) -> None:
     """One metric of all filters, averaged over runs."""
     name_panel(ax, readable(metric), unit_text(metric["unit"], length_unit))
-    rows = {label: bands(curve, metric["over_time"] == "rms") for label, curve in curves.items() if curve.runs > 0}
-    if not rows:
+    curves = {label: curve for label, curve in curves.items() if curve.runs > 0}
+    if not curves:
         empty_panel(ax, "no run without failure")
         return
+    is_root = metric["over_time"] == "rms"
+    is_log = needs_log([bands(curve, is_root)[0][0] for curve in curves.values()])
+    rows = {label: bands(curve, is_root, is_log) for label, curve in curves.items()}
+    if metric["name"] in (*SHARES, *BANDED):
+        rows = {label: (inner, None) for label, (inner, _) in rows.items()}
     n_steps = max(inner.shape[1] for inner, _ in rows.values())
     for place, (label, (inner, outer)) in enumerate(rows.items()):
         (color, dashes), (mean, low, high) = styles[label], inner
@@ -147,10 +150,18 @@ def draw_curves(
     if n_steps == 1:
         ax.set_xticks(range(len(rows)), ["" for _ in rows])
         ax.set_xlim(-0.6, len(rows) - 0.4)
+    ends = draw_band(ax, metric, max(curve.runs for curve in curves.values()))
+    if is_log:
+        low, high = value_range([ends, *(inner[0] for inner, _ in rows.values())])
+        log_axis(ax, 0.6 * low, 1.8 * high)
+        return
+    if metric["name"] in SHARES:
+        ax.set_ylim(-0.03, 1.03)
+        return
     limit(
         ax,
         metric,
-        [inner for inner, _ in rows.values()],
+        [ends, *(inner for inner, _ in rows.values())],
         [inner if outer is None else outer for inner, outer in rows.values()],
     )
 
@@ -228,11 +239,15 @@ def draw_run(ax: Axes, series: Series, failures: Mapping[str, np.ndarray], style
     if n_steps == 1:
         ax.set_xticks(range(len(values)), ["" for _ in values])
         ax.set_xlim(-0.6, len(values) - 0.4)
+    is_log = needs_log(list(values.values()))
+    if is_log:
+        low, high = value_range(list(values.values()))
+        log_axis(ax, 0.7 * low, 1.4 * high)
     lost = [(place, label) for place, label in enumerate(values) if failures[label].any()]
     if lost:
         # a strip of its own for the crosses, below the curves
-        low, high = ax.get_ylim()
-        ax.set_ylim(low - (0.06 + 0.07 * len(lost)) * (high - low), high)
+        (low, high), strip = ax.get_ylim(), 0.06 + 0.07 * len(lost)
+        ax.set_ylim(low * (low / high) ** strip if is_log else low - strip * (high - low), high)
     for row, (place, label) in enumerate(lost):
         failed = np.flatnonzero(failures[label])
         at = np.full(len(failed), place) if n_steps == 1 else failed + 1

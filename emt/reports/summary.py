@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from emt.reports.segments import segment_numbers
 from emt.status import FAILURE, Status
 from emt.store import RunReader
 
@@ -196,7 +197,7 @@ def summarise(reader: RunReader) -> dict[str, Any]:
     identity, metrics = manifest["identity"], manifest["metrics"]
     first_step = identity["config"]["skip_steps"]
     runs = max((chunk.stop for chunk in reader.chunks()), default=0)
-    filters, flags = {}, {}
+    filters, flags, segments = {}, {}, {}
     for label in scored_labels(reader):
         results = filter_results(reader, label)
         filters[label] = {
@@ -204,6 +205,9 @@ def summarise(reader: RunReader) -> dict[str, Any]:
             for column, metric in enumerate(metrics)
             if label not in metric["without"]
         }
+        if identity["config"].get("segments"):
+            lacking = [metric["name"] for metric in metrics if label in metric["without"]]
+            segments[label] = segment_numbers(reader, results.step_sum, results.step_count, lacking)
         names = Counter(name for bits in results.status for name in Status.names_of(int(bits)))
         failed = ~results.sound
         flags[label] = {
@@ -220,7 +224,20 @@ def summarise(reader: RunReader) -> dict[str, Any]:
         "status": flags,
         "labels": scored_labels(reader),
         "metrics": metrics,
-    }
+    } | ({"segments": segments} if segments else {})
+
+
+def mode_shares(reader: RunReader, label: str) -> np.ndarray | None:
+    """Mean probability (step, mode) of a filter's modes over the runs without failure; None where it is not known."""
+    total: np.ndarray | float = 0.0
+    runs = 0
+    for chunk in reader.chunks():
+        arrays = reader.read_chunk(chunk)
+        if f"{label}/mode_sum" not in arrays:
+            return None
+        total = total + arrays[f"{label}/mode_sum"]
+        runs += int(arrays[f"{label}/step_count"].sum())
+    return np.asarray(total) / runs if runs else None
 
 
 def curves(reader: RunReader, label: str) -> dict[str, Curve]:

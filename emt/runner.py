@@ -31,6 +31,8 @@ from emt.store import RunFolder
 TRACK_FIGURE = "track.png"
 FEWEST_MODES = 3
 """Of the filter with most, for a figure of mode probabilities; those of two modes fit among the metrics."""
+LONGEST_QUICK = 500
+"""Steps of a run up to which a program compiled in a hurry saves time."""
 SHORT_SECONDS = 3.0
 """Experiments that take less are computed again for the record of costs."""
 
@@ -154,6 +156,7 @@ def run(
     runs: int | None = None,
     more: int = 0,
     figures: bool = True,
+    quick: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> dict[str, Any]:
     """Runs what is missing of an experiment and writes summary, tables and figures; returns the summary.
@@ -163,6 +166,7 @@ def run(
         runs: number of runs wanted in all; by default that of the configuration.
         more: number of runs to add to those in the folder, instead.
         figures: whether figures are drawn beside the tables.
+        quick: whether programs are compiled in a hurry, for a few runs that are not long.
 
     Raises:
         ConfigError: the recording cannot be used.
@@ -177,7 +181,8 @@ def run(
         else:
             total = loaded.experiment.monte_carlo.runs if runs is None else runs
         missing = folder.missing(total, chunk_size)
-        engine = Engine(program, loaded.experiment.monte_carlo.seed, chunk_size)
+        quick = quick and program.n_steps <= LONGEST_QUICK
+        engine = Engine(program, loaded.experiment.monte_carlo.seed, chunk_size, quick=quick)
         running = Running()
         for chunk in folder.chunks():
             running.add(labels, folder.read_chunk(chunk))  # a damaged chunk is found before anything is computed

@@ -45,6 +45,27 @@ def pytest_configure(config: pytest.Config) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+LONGEST = (
+    "tuning/test_search",
+    "test_documents",
+    "cli/test_",
+    "filters/test_shape",
+    "montecarlo/",
+    "regression/",
+    "filters/",
+)
+"""Files that take longest, first: whoever is done early takes the short ones."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Orders files by how long they take."""
+
+    def place(item: pytest.Item) -> int:
+        return next((k for k, part in enumerate(LONGEST) if part in item.nodeid), len(LONGEST))
+
+    items.sort(key=place)
+
+
 @pytest.fixture(scope="session")
 def golden() -> Path:
     """Folder of the vectors made with the authors' own codes."""

@@ -63,7 +63,7 @@ def verify(
 
 def check(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[EXPERIMENT]...", help="All shipped by default.")
+        list[str] | None, typer.Argument(metavar="[EXPERIMENT|PAPER]...", help="All shipped by default.")
     ] = None,
     baselines: Annotated[Path | None, typer.Option(help="Folder of baselines; default results/baselines.")] = None,
     update: Annotated[bool, typer.Option("--update", help="Write the present results as the new baselines.")] = False,
@@ -79,13 +79,14 @@ def check(
 
     from emt.cli.running import run_shown
     from emt.config.load import at_smoke_scale, load_experiment
-    from emt.config.shipped import SHIPPED, config_names
+    from emt.config.shipped import SHIPPED, config_names, papers
     from emt.device import environment
     from emt.reports.baseline import BaselineError, baseline_of, changes_table, compare, read_baseline
 
     if baselines is None:
         baselines = SHIPPED / "results" / "baselines"
-    loaded = [at_smoke_scale(load_experiment(name)) for name in names or config_names()]
+    wanted = [one for name in names or papers() for one in (config_names(name) if name in papers() else [name])]
+    loaded = [at_smoke_scale(load_experiment(name)) for name in wanted]
     loaded = [item for item in loaded if item.experiment.scenario.kind != "recorded"]  # these need the user's file
     paths = {item.name: baselines / f"{item.name}.json" for item in loaded}
     try:
@@ -95,7 +96,7 @@ def check(
     changes = []
     with tempfile.TemporaryDirectory() as scratch:
         for item in loaded:
-            summary = run_shown(item, Path(scratch) / item.name, figures=False)
+            summary = run_shown(item, Path(scratch) / item.name, figures=False, quick=True)
             now = baseline_of(summary, environment())
             if update:
                 path = paths[item.name]

@@ -73,7 +73,9 @@ def run(
         raise typer.Exit(CHECK_FAILED)
 
 
-def run_shown(loaded, folder: Path, *, more: int = 0, runs: int | None = None, figures: bool = True):
+def run_shown(
+    loaded, folder: Path, *, more: int = 0, runs: int | None = None, figures: bool = True, quick: bool = False
+):
     """Runs an experiment under a live view; an interruption becomes a message that says how to go on."""
     from emt.cli.display import LiveView
     from emt.runner import run as run_experiment
@@ -88,7 +90,8 @@ def run_shown(loaded, folder: Path, *, more: int = 0, runs: int | None = None, f
                 last = progress
                 view.update(progress)
 
-            return run_experiment(loaded, folder, runs=runs, more=more, figures=figures, on_progress=update)
+            options = {"figures": figures, "quick": quick, "on_progress": update}
+            return run_experiment(loaded, folder, runs=runs, more=more, **options)
     except KeyboardInterrupt:
         kept = f"{last.done} of {last.total}" if last is not None else "all finished"
         message = f"interrupted: {kept} runs are kept in {folder}; the same command continues"

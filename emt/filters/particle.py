@@ -11,7 +11,7 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 from pydantic import Field, PositiveInt
 
-from emt.filters.gaussian import Belief, Innovation, Kernel, Prediction, conditioned
+from emt.filters.gaussian import Belief, Innovation, Kernel, Prediction, conditioned, symmetric
 from emt.filters.kalman import kalman_kernel
 from emt.filters.mixing import posterior
 from emt.filters.resampling import effective_fraction, systematic
@@ -199,7 +199,7 @@ def particle(
         about = jax.vmap(lambda z: measurement.difference(z, seen[0]))(seen)
         shift = weights @ about
         gaps = about - shift[None, :]
-        cov = (weights[:, None, None] * gaps[:, :, None] * gaps[:, None, :]).sum(axis=0) + measurement.noise_cov()
+        cov = (weights[:, None, None] * (gaps[:, :, None] * gaps[:, None, :])).sum(axis=0) + measurement.noise_cov()
         nothing = Belief(jnp.zeros_like(shift), jnp.zeros_like(cov))
         return conditioned(nothing, jnp.zeros_like(cov), cov, measurement.difference(value, seen[0] + shift))[1]
 
@@ -229,7 +229,8 @@ def particle(
             new = state._replace(particles=particles, own=state.own._replace(covs=covs))
         weights, total = posterior(state.weights, gains)
         told = innovation._replace(log_likelihood=total)
-        return new._replace(weights=weights), info_of(told, seen, effective_samples=effective_fraction(weights))
+        effective = effective_fraction(jnp.where(seen, weights, state.weights))
+        return new._replace(weights=weights), info_of(told, seen, effective_samples=effective)
 
     return Filter(init, predict, update, lambda state: report(model, moments(state)))
 
@@ -239,7 +240,7 @@ def moments(state: ParticleState) -> Belief:
     weights = state.weights
     mean = weights @ state.particles
     gaps = state.particles - mean[None, :]
-    return Belief(mean, (weights[:, None] * gaps).T @ gaps + jnp.diag(state.floor))
+    return Belief(mean, symmetric((weights[:, None] * gaps).T @ gaps) + jnp.diag(state.floor))
 
 
 def build(settings: ParticleSettings):

@@ -108,7 +108,7 @@ def ukf_kernel(
             points = points + sigma_points(jnp.zeros(n, noise.dtype), columns, step)
         mean = for_mean @ points
         gaps = points - mean[None, :]
-        cov = (for_cov[:, None, None] * gaps[:, :, None] * gaps[:, None, :]).sum(axis=0)
+        cov = (for_cov[:, None, None] * (gaps[:, :, None] * gaps[:, None, :])).sum(axis=0)
         new = Belief(mean, cov if rule == "augmented" else cov + noise)
         return Prediction(new, points_of(new) if rule == "redrawn" else points)
 
@@ -119,7 +119,7 @@ def ukf_kernel(
         about = jax.vmap(lambda z: measurement.difference(z, seen[0]))(seen)
         shift = for_mean @ about
         gaps, off = about - shift[None, :], now.points - now.belief.mean[None, :]
-        cov = (for_cov[:, None, None] * gaps[:, :, None] * gaps[:, None, :]).sum(axis=0)
+        cov = (for_cov[:, None, None] * (gaps[:, :, None] * gaps[:, None, :])).sum(axis=0)
         cross = (for_cov[:, None, None] * off[:, :, None] * gaps[:, None, :]).sum(axis=0)
         cov = cov + (measurement.noise_cov() if measurement_cov is None else measurement_cov)
         return conditioned(now.belief, cross, cov, measurement.difference(value, seen[0] + shift))

@@ -193,7 +193,8 @@ def likely_model_set(
         else:
             rank = places(jnp.where(union, -log_weight, jnp.inf))
             dropped = union & (unlikely | (rank >= keep)) & (rank > 0)  # the most probable one stays
-        info = info_of(pooled(innovation, probability, total), seen, active_models=number(union, probability.dtype))
+        ran = number(jnp.where(seen, union, state.active), probability.dtype)
+        info = info_of(pooled(innovation, probability, total), seen, active_models=ran)
         return Sets(probability, state.predicted, beliefs, state.time, union & ~dropped), info
 
     return Filter(
@@ -271,7 +272,8 @@ def model_group_switching(model: StateSpaceModel, members: np.ndarray, first: in
         group = jnp.where(drop_old, candidate, group)
         candidate = jnp.where(drop_new, group, candidate)
         active = table[group] | table[candidate]
-        info = info_of(pooled(innovation, probability, total), seen, active_models=number(union, probability.dtype))
+        ran = number(jnp.where(seen, union, sets.active), probability.dtype)
+        info = info_of(pooled(innovation, probability, total), seen, active_models=ran)
         sets = Sets(probability, sets.predicted, beliefs, sets.time, active)
         return GroupState(sets, group, candidate, jnp.where(candidate == group, 0.0, log_ratio)), info
 

@@ -90,11 +90,21 @@ def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, n
     return {name: np.asarray(value) for name, value in arrays.items()}
 
 
-class Engine:
-    """Runs chunks of one experiment; compiled once, for the chunk size."""
+QUICK_COMPILATION: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+"""Options of XLA for programs that run once on few runs: compiling takes longer than running. Results differ in
+rounding."""
 
-    def __init__(self, program: Program, seed: int, chunk_size: int):
+
+class Engine:
+    """Runs chunks of one experiment; compiled once, for the chunk size.
+
+    Args:
+        quick: compile in a hurry, for a few runs.
+    """
+
+    def __init__(self, program: Program, seed: int, chunk_size: int, *, quick: bool = False):
         self.program, self.seed, self.chunk_size = program, jnp.asarray(seed), chunk_size
+        self._options = QUICK_COMPILATION if quick and jax.default_backend() == "cpu" else None
         self._compiled: dict[str, Any] = {}
         self.seconds: dict[str, list[float]] = {label: [] for label in program.filter_params}
         """Wall-clock time of filter and metrics of each chunk so far, by filter."""
@@ -115,9 +125,9 @@ class Engine:
         def build(name: str):
             on_start(name or "scenario")
             if not name:
-                return simulator.lower(program.world, self.seed, runs).compile()
+                return simulator.lower(program.world, self.seed, runs).compile(self._options)
             arguments = (program.world, program.filter_params[name], self.seed, runs, shapes.scans, shapes.truth)
-            return program.scorer(name).lower(*arguments).compile()
+            return program.scorer(name).lower(*arguments).compile(self._options)
 
         names = ["", *self.labels()]
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -139,7 +149,7 @@ class Engine:
         program, n = self.program, stop - start
         experiment, world = program.experiment, program.world
         runs = jnp.asarray(chunk_runs(start, stop, self.chunk_size))
-        simulation = self._compiled[""](world, self.seed, runs)
+        simulation = jax.block_until_ready(self._compiled[""](world, self.seed, runs))
         target, arrays = simulation.truth, {}
         tracked = n if experiment.traces else min(tracked, n)
         for label in self.labels():

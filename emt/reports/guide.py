@@ -9,6 +9,9 @@ from emt.reports.numbers import significant, unit_text, value_and_error
 from emt.reports.table import Column, Table
 from emt.settings import Settings, UnitInterval
 
+SAME_COST = 1.25
+"""Ratio up to which costs count as equal: they are measured in company."""
+
 
 class Situation(Settings):
     """A situation, the experiment that stands for it, and the filters to choose from."""
@@ -41,6 +44,14 @@ def candidates(situation: Situation, summary: dict[str, Any], costs: Mapping[str
     return sorted(found, key=lambda one: one.value)
 
 
+def choice(found: list[Candidate], within: float) -> Candidate:
+    """The best of the cheapest among those nearly as good as the best."""
+    best = min(one.value for one in found)
+    good = [one for one in found if one.value <= (1.0 + within) * best]
+    cheapest = min(one.cost for one in good)
+    return min((one for one in good if one.cost <= SAME_COST * cheapest), key=lambda one: one.value)
+
+
 def guide_table(
     situations: tuple[Situation, ...],
     summaries: Mapping[str, dict[str, Any]],
@@ -66,8 +77,7 @@ def guide_table(
         found = candidates(situation, summary, costs.get(situation.experiment, {})) if summary else []
         if not found or summary is None:
             continue
-        good = [one for one in found if one.value <= (1.0 + situation.within) * found[0].value]
-        chosen = min(good, key=lambda one: one.cost)
+        chosen = choice(found, situation.within)
         metric = next(m for m in summary["metrics"] if m["name"] == situation.metric)
         unit = unit_text(metric["unit"], units[situation.experiment])
         value, error = value_and_error(chosen.value, chosen.error)
@@ -91,7 +101,8 @@ def guide_table(
             for one in found
         ]
     note = (
-        "Chosen is the cheapest of the filters whose error is within 5 % of the smallest. Costs are wall-clock times "
-        "of filter and metrics in the run of this report, on the machine that made it."
+        "Chosen is the cheapest of the filters whose error is within 5 % of the smallest; costs within a quarter of "
+        "each other count as equal. They are wall-clock times of filter and metrics in the run of this report, on the "
+        "machine that made it."
     )
     return Table("Which filter when", columns, rows, values, [note]) if rows else None

@@ -104,7 +104,7 @@ def test_runs_differ_and_repeat():
         ({"markov": {"transition": [[0.5, 0.5], [0.5, 0.5]]}}, "expected 5 rows of 5"),
         ({"markov": {"transition": (np.eye(5) * 0.9).tolist()}}, "sums to 0.9, not 1"),
         ({"markov": {"transition": np.eye(5)[[0, 0, 1, 2, 3]].T.tolist()}}, "give the transpose"),
-        ({"markov": {}}, "either stay or transition"),
+        ({"markov": {}}, "one of stay, changes or transition"),
     ],
     ids=str,
 )

@@ -27,8 +27,8 @@ from emt.models.state_space.motions import (
 from emt.registry import load_function
 from emt.settings import (
     Acceleration,
+    Covariance2,
     Length,
-    NoiseCovariance,
     PositiveAngle,
     PositiveFloat,
     PositiveLength,
@@ -177,7 +177,7 @@ class PositionSettings(Settings):
     """The position in the plane."""
 
     kind: Literal["position"] = "position"
-    noise_cov: NoiseCovariance
+    noise_cov: Covariance2
     states: ClassVar[tuple[str, ...]] = ("x", "y")
     size: ClassVar[int] = 2
 

@@ -27,7 +27,7 @@ register(
         "1",
         "neither",
         "normalised innovation squared of the scan mean, or of the measurement of a point (2, or its count of numbers, "
-        "if consistent), mean over steps",
+        "if consistent; 0 where a scan is empty), mean over steps",
         lambda estimate, truth, info: info.nis,
         applies_to=anything,
         dof=measured,

@@ -19,7 +19,6 @@ CHECKED = {
     "growth": ["ekf", "upf"],
     "range_bearing": ["ukf", "upf"],
     "maneuver": ["static_floor", "imm", "gpb2"],
-    "maneuver_markov": ["gpb1", "imm"],
     "thirteen_ds1": ["imm", "lms", "mgs", "imm5"],
 }
 """Filters that are run again; the report has all of them."""

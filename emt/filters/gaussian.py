@@ -83,9 +83,9 @@ def conditioned(
 ) -> tuple[Belief, Innovation]:
     """The belief given an innovation ν of covariance S = L Lᵀ whose cross-covariance with the state is C.
 
-    With W = L⁻¹ Cᵀ: mean + Wᵀ L⁻¹ ν and P - Wᵀ W, which is P - K S Kᵀ and symmetric to the last bit if P is. It keeps
-    digits while P / R stays below about 1e13. A square-root update by QR, as JAX libraries have it, has no such bound and
-    takes ten times as long in batches of four states.
+    With W = L⁻¹ Cᵀ: mean + Wᵀ L⁻¹ ν and P - Wᵀ W, which is P - K S Kᵀ and symmetric to the last bit if P is. It
+    keeps digits while P / R stays below about 1e13. A square-root update by QR, as JAX libraries have it, has no such
+    bound and takes ten times as long in batches of four states.
     """
     root = cholesky(innovation_cov)
     gain, white = forward_solve(root, cross.T), forward_solve(root, innovation)

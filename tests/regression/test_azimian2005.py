@@ -18,8 +18,8 @@ CHECKED = {
     "linear": ["kf", "predictor"],
     "growth": ["ekf", "upf"],
     "range_bearing": ["ukf", "upf"],
-    "maneuver": ["static_floor", "imm", "gpb2"],
-    "thirteen_ds1": ["imm", "lms", "mgs", "imm5"],
+    "maneuver": ["imm"],
+    "thirteen_ds1": ["imm", "lms", "mgs"],
 }
 """Filters that are run again; the report has all of them."""
 

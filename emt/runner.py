@@ -252,7 +252,8 @@ def write_figures(folder: RunFolder, first_run: dict[str, np.ndarray]) -> None:
         over_time = over_time_figure(scored, metrics, unit, maneuvers=manifest["maneuvers"])
         folder.write_bytes("over_time.png", over_time)
     heading = manifest["title"] or manifest["identity"]["experiment"]
-    is_random = manifest["identity"]["config"]["scenario"].get("switching") is not None  # no two runs are alike
+    scenario = manifest["identity"]["config"]["scenario"]
+    is_random = any(scenario.get(key) is not None for key in ("switching", "markov"))  # no two runs are alike
     if not is_random and any(len(names) >= FEWEST_MODES for names in manifest["modes"].values()):
         found = {label: mode_shares(folder, label) for label in labels if label in manifest["modes"]}
         shares = {label: (manifest["modes"][label], share.T) for label, share in found.items() if share is not None}

@@ -52,7 +52,7 @@ class Kernel(NamedTuple):
 def predicted(belief: Belief, motion: Motion, noise_cov: Float[Array, "n n"], time: Scalar, dt: Scalar) -> Belief:
     """Kalman prediction to `time`, `dt` seconds later: exact for a linear motion, else linearised at the mean.
 
-    Source: Azimian 2005, eqs. 1.10 and 2.6; F P Fᵀ + Q in this order is symmetric but for rounding, so it is made so.
+    Source: Azimian 2005, eq. 2.3; F P Fᵀ + Q in this order is symmetric but for rounding, so it is made so.
     """
     mean, jacobian = motion.linearised(belief.mean, time, dt)
     return Belief(mean, symmetric(jacobian @ belief.cov @ jacobian.T + noise_cov))
@@ -68,7 +68,7 @@ def updated(
 ) -> tuple[Belief, Innovation]:
     """Kalman update with a measurement: exact for a linear one, else linearised at the predicted mean.
 
-    Source: Azimian 2005, eqs. 1.11 and 2.7.
+    Source: Azimian 2005, eq. 2.3.
     """
     expected, jacobian = measurement.linearised(belief.mean, time)
     cross = belief.cov @ jacobian.T

@@ -108,7 +108,7 @@ def predictor_step(
 
     x̂ ← G x̂ + b + K (y - C x̂) and P ← G P (G - K C)ᵀ + Q with K = G P Cᵀ (C P Cᵀ + R)⁻¹.
 
-    Source: Azimian 2005, eqs. 1.7 to 1.9.
+    Source: Azimian 2005, eqs. 1.9 to 1.11, where C' in 1.11 should read C.
     """
     moved, transition = motion.linearised(belief.mean, time, dt)
     expected, matrix = model.measurement.linearised(belief.mean, time - dt)

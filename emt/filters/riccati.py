@@ -19,7 +19,7 @@ def steady_covariance(
     change nothing. Every pass adds positive terms.
 
     Source: Anderson 1978, "Second-order convergent algorithms for the steady-state Riccati equation"; Azimian 2005,
-    eq. 1.13, whose C' should read C.
+    eq. 1.13.
     """
     eye = jnp.eye(transition.shape[0], dtype=transition.dtype)
     a, g, h = transition.T, matrix.T @ jnp.linalg.solve(measurement_cov, matrix), noise_cov

@@ -86,7 +86,7 @@ def ukf_kernel(
     Args:
         noise_cov, measurement_cov: noises to believe in, if not those of the model.
 
-    Source: Julier and Uhlmann 1997; Azimian 2005, eqs. 2.10 to 2.23.
+    Source: Julier and Uhlmann 1997; Azimian 2005, eqs. 2.11 to 2.23.
     """
     n = len(model.point.names)
     dimension = 2 * n if rule == "augmented" else n

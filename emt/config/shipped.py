@@ -6,6 +6,10 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 SHIPPED = _PACKAGE.parent if (_PACKAGE.parent / "configs").is_dir() else _PACKAGE / "_shipped"
 
 
+BENCHMARK = "benchmark"
+"""Folder of the shipped experiments that are workloads of `emt bench` and belong to no paper."""
+
+
 def config_names(paper: str | None = None) -> list[str]:
     """Names of the shipped experiments, `PAPER/EXPERIMENT`, of one paper or of all."""
     root = SHIPPED / "configs"
@@ -15,7 +19,7 @@ def config_names(paper: str | None = None) -> list[str]:
 
 def papers() -> list[str]:
     """Keys of the papers with shipped experiments."""
-    return sorted({name.split("/")[0] for name in config_names()})
+    return sorted({name.split("/")[0] for name in config_names()} - {BENCHMARK})
 
 
 def config_path(name: str) -> Path:

@@ -5,6 +5,7 @@ still there after any kill, full disk or power cut; results of two configuration
 writes.
 """
 
+from bisect import bisect_left, insort
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ class RunFolder(RunReader):
 
     def __init__(self, path: str | Path, fs: FileSystem, lock: FolderLock):
         self._lock = lock
+        self._ranges: list[tuple[int, int]] | None = None
         super().__init__(path, fs)
 
     @classmethod
@@ -79,7 +81,7 @@ class RunFolder(RunReader):
             raise ValueError(f"a chunk needs 0 <= start < stop, not {start} and {stop}")
         path = self.path / chunk_name(start, stop)
         data = encode_chunk(arrays, int(start), int(stop), self.fingerprint)
-        clash = [chunk for chunk in self.chunks() if chunk.start < stop and start < chunk.stop]
+        clash = self._clashes(start, stop)
         with in_words("write the chunk", path):
             if [chunk.path for chunk in clash] == [path] and self._holds(path, data):
                 self._fs.fsync_dir(self.path)  # the failed call may have missed just this
@@ -89,7 +91,11 @@ class RunFolder(RunReader):
                     "and nothing is overwritten. Remove that file to have its runs computed anew."
                 )
             else:
+                ranges, self._ranges = self._ranges, None  # a call that fails may leave the file or not
                 write_atomically(self._fs, path, data)
+                if ranges is not None:
+                    insort(ranges, (start, stop))
+                self._ranges = ranges
         return Chunk(int(start), int(stop), path)
 
     def write_json(self, name: str, value: Any) -> Path:
@@ -118,6 +124,20 @@ class RunFolder(RunReader):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _clashes(self, start: int, stop: int) -> list[Chunk]:
+        """Stored chunks that hold some of the runs `start` to `stop - 1`.
+
+        The folder is listed at the first call only, because nobody else writes, and again before a refusal, because
+        files may be removed by hand. Listing it for every chunk would take time with the square of their number.
+        """
+        if self._ranges is not None:
+            place = bisect_left(self._ranges, (start, start))
+            if all(last <= start or stop <= first for first, last in self._ranges[max(place - 1, 0) : place + 1]):
+                return []
+        chunks = self.chunks()
+        self._ranges = [(chunk.start, chunk.stop) for chunk in chunks]
+        return [chunk for chunk in chunks if chunk.start < stop and start < chunk.stop]
 
     def _write(self, name: str, data: bytes) -> Path:
         self._require_lock()

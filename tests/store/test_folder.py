@@ -294,3 +294,28 @@ def test_message_says_what_to_do(tmp_path, code, advice):
         f"{tmp_path}: cannot open the folder: {os.strerror(code)}. "
         f"{advice}, then run the same command again; finished chunks are kept."
     )
+
+
+def test_writing_many_chunks_lists_the_folder_once(tmp_path):
+    """Otherwise a run of a million chunks would spend its time on listings."""
+    listings = []
+
+    class Counting(FileSystem):
+        def listdir(self, path):
+            listings.append(path)
+            return super().listdir(path)
+
+    with RunFolder.open(tmp_path, make_manifest(), Counting()) as folder:
+        before = len(listings)
+        for start in (40, 0, 20, 60, 10, 30, 50):  # in any order
+            folder.write_chunk(start, start + 10, score_runs(start, start + 10))
+        assert len(listings) - before == 1
+        for start, stop in ((5, 8), (35, 45), (0, 100), (69, 80)):
+            with pytest.raises(StoreError, match="already holds run"):
+                folder.write_chunk(start, stop, score_runs(start, stop))
+        folder.write_chunk(20, 30, score_runs(20, 30))  # the same again
+        (tmp_path / "chunk-000000020-000000030.npz").unlink()
+        folder.write_chunk(20, 28, score_runs(20, 28))  # as the message advises
+        with pytest.raises(StoreError, match="already holds run 27"):
+            folder.write_chunk(27, 30, score_runs(27, 30))
+        assert folder.missing(80, 100) == [(28, 30), (70, 80)]

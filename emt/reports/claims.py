@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 from pydantic import PositiveInt, model_validator
 
+from emt.reports.gathering import filter_results
 from emt.reports.numbers import significant, value_and_error
-from emt.reports.summary import filter_results, window_ratio
+from emt.reports.summary import window_ratio
 from emt.reports.table import Column, Table
 from emt.settings import Settings
 from emt.store import RunReader
@@ -96,8 +97,8 @@ def window_verdict(claim: Claim, reader: RunReader) -> tuple[ClaimVerdict, str]:
         return "not comparable", ""
     if max(claim.window[1], claim.against[1]) > reader.manifest["steps"]:
         return "not comparable", ""
-    results = filter_results(reader, claim.filter)
-    ratio, error = window_ratio(results, names.index(claim.metric), claim.window, claim.against)
+    results = filter_results(reader, claim.filter, [names.index(claim.metric)])
+    ratio, error = window_ratio(results, 0, claim.window, claim.against)
     if math.isnan(error):
         return "not comparable", ""
     return verdict_of(ratio - 1.0, error), f"ratio {significant(ratio, 4)} ± {significant(error, 2)}"

@@ -7,7 +7,6 @@ import numpy as np
 
 from emt.reports.numbers import unit_text, value_and_error
 from emt.reports.table import Column, Table
-from emt.store import RunReader
 
 RULES = ("rms", "pooled")
 """Rules over runs that a stretch of time has as well."""
@@ -36,23 +35,20 @@ def segment_number(sums: np.ndarray, counts: np.ndarray, rule: str) -> dict[str,
     return {"value": value, "se": error if math.isfinite(error) else None, "runs_used": runs}
 
 
-def segment_numbers(reader: RunReader, sums: np.ndarray, counts: np.ndarray, without: list[str]) -> dict[str, Any]:
-    """Metric -> segment -> number, of one filter.
+def segment_numbers(
+    segments: dict[str, list[int]], sums: np.ndarray, counts: np.ndarray, metric: dict[str, Any]
+) -> dict[str, Any]:
+    """Segment -> number, of one metric of one filter.
 
     Args:
-        sums: (block, step, metric).
+        segments: first and last scan (from 1) of each.
+        sums: (block, step).
         counts: (block,).
-        without: metrics that the filter does not have.
     """
-    segments = reader.manifest["identity"]["config"].get("segments", {})
-    found: dict[str, Any] = {}
-    for column, metric in enumerate(reader.manifest["metrics"]):
-        if metric["over_runs"] in RULES and metric["name"] not in without:
-            found[metric["name"]] = {
-                name: segment_number(sums[:, first - 1 : last, column], counts, metric["over_runs"])
-                for name, (first, last) in segments.items()
-            }
-    return found
+    return {
+        name: segment_number(sums[:, first - 1 : last], counts, metric["over_runs"])
+        for name, (first, last) in segments.items()
+    }
 
 
 def segments_table(summary: dict[str, Any], length_unit: str) -> Table | None:

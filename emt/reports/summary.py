@@ -1,19 +1,25 @@
 """From stored chunks to the summary of an experiment: every metric of every filter with its uncertainty."""
 
 import math
-from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from emt.reports.segments import segment_numbers
-from emt.status import FAILURE, Status
+from emt.reports.gathering import (
+    FilterResults,
+    Total,
+    column_groups,
+    filter_results,
+    mean_of,
+    run_flags,
+    step_totals,
+    variance_of,
+)
+from emt.reports.segments import RULES, segment_numbers
 from emt.store import RunReader
 
 SUMMARY_FILE = "summary.json"
-MAX_BLOCKS = 512
-"""Blocks of runs whose sums per step are held at a time."""
 
 
 class Curve(NamedTuple):
@@ -26,60 +32,13 @@ class Curve(NamedTuple):
     runs: int
 
 
-class FilterResults(NamedTuple):
-    """Scores of one filter in all runs, and its sums per step."""
-
-    values: np.ndarray
-    """(run, metric)."""
-    status: np.ndarray
-    failed_step: np.ndarray
-    nis: np.ndarray
-    step_sum: np.ndarray
-    """(block, step, metric)."""
-    step_count: np.ndarray
-    """(block,)."""
-    step_squares: np.ndarray
-    """(step, metric)."""
-
-    @property
-    def sound(self) -> np.ndarray:
-        """True for the runs without a failure bit."""
-        return (self.status & int(FAILURE)) == 0
-
-
-def filter_results(reader: RunReader, label: str) -> FilterResults:
-    """All chunks of one filter, in run order; sums per step are merged as they come, to at most `MAX_BLOCKS` blocks."""
-    per_run: dict[str, list[np.ndarray]] = {name: [] for name in ("values", "status", "failed_step", "nis")}
-    sums: list[np.ndarray] = []
-    counts: list[int] = []
-    squares: np.ndarray | float = 0.0
-    for chunk in reader.chunks():
-        arrays = reader.read_chunk(chunk, [f"{label}/{name}" for name in FilterResults._fields])
-        for name, parts in per_run.items():
-            parts.append(arrays[f"{label}/{name}"])
-        sums += list(arrays[f"{label}/step_sum"])
-        counts += arrays[f"{label}/step_count"].tolist()
-        squares = squares + arrays[f"{label}/step_squares"]
-        if len(sums) > MAX_BLOCKS:
-            sums = [sum(pair[1:], pair[0]) for pair in batched(sums, 2)]
-            counts = [sum(pair) for pair in batched(counts, 2)]
-    whole = {name: np.concatenate(parts) for name, parts in per_run.items()}
-    return FilterResults(
-        **whole, step_sum=np.stack(sums), step_count=np.array(counts), step_squares=np.asarray(squares)
-    )
-
-
-def batched(items: list, n: int) -> list[list]:
-    """Consecutive groups of `n` items; the last may be shorter."""
-    return [items[k : k + n] for k in range(0, len(items), n)]
-
-
 def standard_error_of_std(values: np.ndarray) -> float:
     """Standard error of the sample standard deviation, from the sample's own fourth moment."""
-    n, variance = len(values), float(np.var(values, ddof=1))
+    n, variance = len(values), variance_of(values)
     if variance == 0.0 or n < 4:
         return math.nan
-    fourth = float(np.mean((values - values.mean()) ** 4))
+    mean = values.mean()
+    fourth = mean_of(values, lambda some: (some - mean) ** 4)
     return math.sqrt(max(fourth - variance**2 * (n - 3) / (n - 1), 0.0) / n) / (2.0 * math.sqrt(variance))
 
 
@@ -97,11 +56,10 @@ def rms_over_runs(results: FilterResults, column: int, first_step: int) -> tuple
 
 def pooled_over_runs(values: np.ndarray) -> tuple[float, float]:
     """Root of the mean square over runs and steps from those of runs, with its standard error to first order."""
-    squares = values**2
-    value = math.sqrt(float(np.mean(squares)))
+    value = math.sqrt(mean_of(values, np.square))
     if len(values) < 2 or value == 0.0:
         return value, math.nan
-    return value, float(np.std(squares, ddof=1)) / math.sqrt(len(values)) / (2.0 * value)
+    return value, math.sqrt(variance_of(values, np.square) / len(values)) / (2.0 * value)
 
 
 def peak_over_steps(results: FilterResults, column: int, first_step: int) -> tuple[float, float]:
@@ -156,9 +114,9 @@ def window_ratio(
 
 def summarise_metric(metric: dict[str, Any], results: FilterResults, column: int, first_step: int) -> dict[str, Any]:
     """value, se, std, median and runs_used of one metric; None where the runs do not allow a number."""
-    values = results.values[results.sound, column]
+    values = results.values[column]
     n = len(values)
-    std = float(np.std(values, ddof=1)) if n > 1 else math.nan
+    std = math.sqrt(variance_of(values)) if n > 1 else math.nan
     value = se = median = math.nan
     if n:
         median = float(np.median(values))
@@ -198,24 +156,18 @@ def summarise(reader: RunReader) -> dict[str, Any]:
     first_step = identity["config"]["skip_steps"]
     runs = max((chunk.stop for chunk in reader.chunks()), default=0)
     filters, flags, segments = {}, {}, {}
+    stretches = identity["config"].get("segments", {})
     for label in scored_labels(reader):
-        results = filter_results(reader, label)
-        filters[label] = {
-            metric["name"]: summarise_metric(metric, results, column, first_step)
-            for column, metric in enumerate(metrics)
-            if label not in metric["without"]
-        }
-        if identity["config"].get("segments"):
-            lacking = [metric["name"] for metric in metrics if label in metric["without"]]
-            segments[label] = segment_numbers(reader, results.step_sum, results.step_count, lacking)
-        names = Counter(name for bits in results.status for name in Status.names_of(int(bits)))
-        failed = ~results.sound
-        flags[label] = {
-            "failed": int(failed.sum()),
-            "failed_runs": [int(run) for run in np.flatnonzero(failed)[:20]],
-            "runs_with": dict(sorted(names.items())),
-            "mean_nis": float(results.nis[results.sound].mean()) if results.sound.any() else None,
-        }
+        filters[label], segments[label] = {}, {}
+        having = [column for column, metric in enumerate(metrics) if label not in metric["without"]]
+        for columns in column_groups(reader, having):
+            results = filter_results(reader, label, columns)
+            for k, metric in enumerate(metrics[column] for column in columns):
+                filters[label][metric["name"]] = summarise_metric(metric, results, k, first_step)
+                if metric["over_runs"] in RULES:
+                    numbers = segment_numbers(stretches, results.step_sum[..., k], results.step_count, metric)
+                    segments[label][metric["name"]] = numbers
+        flags[label] = run_flags(reader, label)
     return {
         "experiment": identity["experiment"],
         "runs": runs,
@@ -224,29 +176,27 @@ def summarise(reader: RunReader) -> dict[str, Any]:
         "status": flags,
         "labels": scored_labels(reader),
         "metrics": metrics,
-    } | ({"segments": segments} if segments else {})
+    } | ({"segments": segments} if segments and stretches else {})
 
 
 def mode_shares(reader: RunReader, label: str) -> np.ndarray | None:
     """Mean probability (step, mode) of a filter's modes over the runs without failure; None where it is not known."""
-    total: np.ndarray | float = 0.0
-    runs = 0
+    total, runs = Total(), 0
     for chunk in reader.chunks():
         arrays = reader.read_chunk(chunk)
         if f"{label}/mode_sum" not in arrays:
             return None
-        total = total + arrays[f"{label}/mode_sum"]
+        total.add(arrays[f"{label}/mode_sum"])
         runs += int(arrays[f"{label}/step_count"].sum())
-    return np.asarray(total) / runs if runs else None
+    return total.value() / runs if runs else None
 
 
 def curves(reader: RunReader, label: str) -> dict[str, Curve]:
     """Every metric of one filter over time; none for a reference filter."""
     if label not in scored_labels(reader):
         return {}
-    results = filter_results(reader, label)
-    n = int(results.step_count.sum())
-    mean = results.step_sum.sum(axis=0) / max(n, 1)
-    variance = np.maximum(results.step_squares / max(n, 1) - mean**2, 0.0)
+    sums, squares, n = step_totals(reader, label)
+    mean = sums / max(n, 1)
+    variance = np.maximum(squares / max(n, 1) - mean**2, 0.0)
     columns = {m["name"]: k for k, m in enumerate(reader.manifest["metrics"]) if label not in m["without"]}
     return {name: Curve(mean[:, k], np.sqrt(variance[:, k]), n) for name, k in columns.items()}

@@ -13,8 +13,8 @@ from scipy.stats import chi2
 import emt.metrics.catalogue  # noqa: F401 - fills the catalogue
 from emt.averaging import OF_SINGLE_RUNS, OverRuns
 from emt.metrics.base import METRICS, find_metric, has, under_rule
+from emt.reports.gathering import FilterResults
 from emt.reports.summary import (
-    FilterResults,
     band,
     peak_over_steps,
     pooled_over_runs,
@@ -38,13 +38,9 @@ def results_of(squares: np.ndarray, status: np.ndarray | None = None, over_time:
     means = squares[:, FIRST:].mean(axis=1)
     blocks = np.array_split(np.arange(runs), BLOCKS)
     return FilterResults(
-        values=(np.sqrt(means) if over_time == "rms" else means)[:, None],
-        status=status,
-        failed_step=np.full(runs, -1),
-        nis=np.zeros(runs),
+        values=(np.sqrt(means) if over_time == "rms" else means)[None, sound],
         step_sum=np.stack([kept[block].sum(axis=0) for block in blocks])[:, :, None],
         step_count=np.array([sound[block].sum() for block in blocks]),
-        step_squares=(kept**2).sum(axis=0)[:, None],
     )
 
 

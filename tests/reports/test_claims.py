@@ -5,7 +5,8 @@ import pytest
 from pydantic import ValidationError
 
 from emt.reports.claims import Claim, bound_verdict, order_verdict
-from emt.reports.summary import FilterResults, window_ratio
+from emt.reports.gathering import FilterResults
+from emt.reports.summary import window_ratio
 
 BASE = {"text": "t", "experiment": "e", "metric": "m"}
 
@@ -61,7 +62,7 @@ def test_the_ratio_of_windows_and_its_error():
     def ratio(n_blocks=40):
         sums = np.concatenate([rng.gamma(4.0, 1.0, (n_blocks, 50)), rng.gamma(4.0, 2.0, (n_blocks, 50))], axis=1)
         none = np.zeros(0)
-        results = FilterResults(none, none, none, none, sums[:, :, None], np.ones(n_blocks), none)
+        results = FilterResults(none, sums[:, :, None], np.ones(n_blocks))
         return window_ratio(results, 0, (51, 100), (1, 50))
 
     found = np.array([ratio() for _ in range(300)])

@@ -1,0 +1,98 @@
+"""The workloads of the benchmark in plain NumPy, in two forms: one run after the other, and all runs at once.
+
+The first form is a loop over runs and steps about the textbook's functions in this folder; the second is
+`tests.reference.batched`, the same equations on arrays with an axis for the runs. Both read the settings of the
+experiments in `configs/benchmark` and the scans that were simulated for them, and report what the filters report.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emt.config.experiment import Experiment
+from emt.models.motion import WhiteAccelerationSettings
+from tests.reference import vb
+from tests.reference.batched import vb as batched_vb
+from tests.reference.worlds import EllipseWorld
+
+Array = NDArray[np.float64]
+
+
+class Scans(NamedTuple):
+    """Measurements of several runs, and what the filters are told of each run."""
+
+    points: Array
+    """(run, step, slot, m), the real ones of a scan in its first slots; the others hold any finite numbers."""
+    mask: NDArray[np.bool_]
+    """(run, step, slot), true where a measurement is."""
+    prior_mean: Array | None = None
+    """Mean of the prior (run, n), where each run has its own."""
+
+
+class Reference(NamedTuple):
+    """A workload in NumPy."""
+
+    per_run: Callable[[Experiment, Scans], Array]
+    """Reports (run, step, k), by a loop over runs and steps: x, y, vx, vy, both semi-axes and the orientation of
+    ellipses, else the mean of the state."""
+    batched: Callable[[Experiment, Scans], Array]
+    """The same with all runs at once."""
+    exact: bool
+    """Whether the reports are those of the filter but for rounding; if not, its random numbers are others, and the
+    reports are alike in distribution."""
+
+
+def ellipse_world(experiment: Experiment) -> EllipseWorld:
+    """What the filters of an ellipse are told.
+
+    Raises:
+        ValueError: the experiment starts with an update, or its process noise is another one.
+    """
+    model, noise = experiment.model, experiment.model.process_noise
+    if experiment.start_with != "predict" or not isinstance(noise, WhiteAccelerationSettings):
+        raise ValueError("the references predict before the first scan, under white acceleration")
+    prior = model.prior
+    return EllipseWorld(
+        experiment.scenario.dt, noise.psd, np.array(model.noise_cov), model.extent_scale, np.array(prior.mean),
+        np.array(prior.cov), prior.orientation, np.array(prior.semi_axes), prior.turn_rate, prior.turn_rate_variance,
+    )  # fmt: skip
+
+
+def run_by_run(track: Callable[[list[Array]], list[Array]], scans: Scans) -> Array:
+    """Reports of every run in turn; `track` takes the real points (n, m) of each scan."""
+    rows = zip(scans.points, scans.mask, strict=True)
+    return np.array([track([p[seen] for p, seen in zip(points, mask, strict=True)]) for points, mask in rows])
+
+
+def vb_per_run(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.vb`."""
+    world, settings = ellipse_world(experiment), experiment.filters["vb"]
+    (F, Q), a = world.motion(), np.array(settings.shape)
+
+    def track(points: list[Array]) -> list[Array]:
+        b, rows = (a - 1.0) * world.semi_axes**2, []
+        state = (world.mean, world.cov, world.orientation, settings.orientation_variance, a, b)
+        for y in points:
+            state = vb.predict(*state, F, Q, settings.orientation_noise, settings.forgetting)
+            state = vb.update(*state, y, world.noise_cov, world.extent_scale, settings.iterations)
+            rows.append(np.array([*state[0], *vb.semi_axes(*state[4:]), state[2]]))
+        return rows
+
+    return run_by_run(track, scans)
+
+
+def vb_batched(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.batched.vb`."""
+    settings = experiment.filters["vb"]
+    return batched_vb.track(
+        scans.points, scans.mask, ellipse_world(experiment), np.array(settings.shape), settings.orientation_variance,
+        settings.orientation_noise, settings.forgetting, settings.iterations,
+    )  # fmt: skip
+
+
+REFERENCES: dict[str, Reference] = {
+    "vb": Reference(vb_per_run, vb_batched, True),
+}
+"""By name of the workload."""

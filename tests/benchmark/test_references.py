@@ -17,6 +17,7 @@ from tests.reference.workloads import REFERENCES, Scans
 RUNS, SEED = 3, 5
 SHORT = {
     "vb": ("scenario.steps=12",),
+    "mem_ekf_star": ("scenario.steps=12",),
 }
 """Settings that make a workload small; the legs of `multiple_model` fix its steps."""
 

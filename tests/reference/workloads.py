@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from emt.config.experiment import Experiment
 from emt.models.motion import WhiteAccelerationSettings
-from tests.reference import vb
-from tests.reference.batched import vb as batched_vb
+from tests.reference import batched, mem_ekf_star, vb
 from tests.reference.worlds import EllipseWorld
 
 Array = NDArray[np.float64]
@@ -86,13 +85,41 @@ def vb_per_run(experiment: Experiment, scans: Scans) -> Array:
 def vb_batched(experiment: Experiment, scans: Scans) -> Array:
     """`tests.reference.batched.vb`."""
     settings = experiment.filters["vb"]
-    return batched_vb.track(
+    return batched.vb.track(
         scans.points, scans.mask, ellipse_world(experiment), np.array(settings.shape), settings.orientation_variance,
         settings.orientation_noise, settings.forgetting, settings.iterations,
     )  # fmt: skip
 
 
+def mem_per_run(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.mem_ekf_star`."""
+    world, settings = ellipse_world(experiment), experiment.filters["mem_ekf_star"]
+    (F, Q), noise = world.motion(), np.array(settings.shape_noise)
+    shape = np.array([world.orientation, *world.semi_axes])
+
+    def track(points: list[Array]) -> list[Array]:
+        state, rows = (world.mean, world.cov, shape, np.array(settings.shape_cov)), []
+        for y in points:
+            state = mem_ekf_star.predict(*state, F, Q, noise)
+            state = mem_ekf_star.update(*state, y, world.extent_scale * np.eye(2), world.noise_cov)
+            angle, axes = mem_ekf_star.ellipse_read_out(state[2])
+            rows.append(np.array([*state[0], *axes, angle]))
+        return rows
+
+    return run_by_run(track, scans)
+
+
+def mem_batched(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.batched.mem_ekf_star`."""
+    settings = experiment.filters["mem_ekf_star"]
+    return batched.mem_ekf_star.track(
+        scans.points, scans.mask, ellipse_world(experiment), np.array(settings.shape_cov),
+        np.array(settings.shape_noise),
+    )  # fmt: skip
+
+
 REFERENCES: dict[str, Reference] = {
     "vb": Reference(vb_per_run, vb_batched, True),
+    "mem_ekf_star": Reference(mem_per_run, mem_batched, True),
 }
 """By name of the workload."""

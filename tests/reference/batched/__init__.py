@@ -3,3 +3,7 @@
 Components come first and runs last, (component, run): every row is contiguous over the runs, so that one call of NumPy
 does one operation of the textbook for all of them. Two-by-two matrices are in closed form.
 """
+
+from tests.reference.batched import mem_ekf_star, vb
+
+__all__ = ["mem_ekf_star", "vb"]

@@ -18,6 +18,7 @@ RUNS, SEED = 3, 5
 SHORT = {
     "vb": ("scenario.steps=12",),
     "mem_ekf_star": ("scenario.steps=12",),
+    "multiple_model": (),
 }
 """Settings that make a workload small; the legs of `multiple_model` fix its steps."""
 

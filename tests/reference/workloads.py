@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emt.config.experiment import Experiment
-from emt.models.motion import WhiteAccelerationSettings
-from tests.reference import batched, mem_ekf_star, vb
+from emt.models.motion import PiecewiseAccelerationSettings, WhiteAccelerationSettings
+from tests.reference import batched, mem_ekf_star, multiple_model, vb
 from tests.reference.worlds import EllipseWorld
 
 Array = NDArray[np.float64]
@@ -118,8 +118,72 @@ def mem_batched(experiment: Experiment, scans: Scans) -> Array:
     )  # fmt: skip
 
 
+class PointWorld(NamedTuple):
+    """Model of a point that switches between motions at nearly constant velocity."""
+
+    accelerations: Array
+    """Known acceleration of each motion (model, 2) [length/time^2]."""
+    variances: Array
+    """Variance of the acceleration that is held over a step (model,) [length^2/time^4]."""
+    transition: Array
+    """[i, j]: probability of motion j next, given i now."""
+    start: Array
+    """Probabilities before the first prediction (model,)."""
+    noise_cov: Array
+    """Of the measured position (2, 2) [length^2]."""
+    prior_cov: Array
+    """Of x, y, vx, vy (4, 4)."""
+    dt: float
+
+
+def point_world(experiment: Experiment) -> PointWorld:
+    """What the filters of a switching point are told.
+
+    Raises:
+        ValueError: the experiment starts with an update, or its process noise is another one.
+    """
+    model = experiment.model
+    motions = list(model.named_motions.values())
+    piecewise = all(isinstance(motion.noise, PiecewiseAccelerationSettings) for motion in motions)
+    if experiment.start_with != "predict" or not piecewise:
+        raise ValueError("the references predict before the first scan, under piecewise acceleration")
+    return PointWorld(
+        np.array([motion.acceleration for motion in motions]), np.array([motion.noise.variance for motion in motions]),
+        np.array(model.transition_matrix), np.array(model.start_probabilities), np.array(model.measurement.noise_cov),
+        np.array(model.prior.cov), experiment.scenario.dt,
+    )  # fmt: skip
+
+
+def imm_per_run(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.multiple_model`."""
+    world = point_world(experiment)
+    F, G = np.kron([[1.0, world.dt], [0.0, 1.0]], np.eye(2)), np.kron([[0.5 * world.dt**2], [world.dt]], np.eye(2))
+    models = [(F, G @ a, q * G @ G.T) for a, q in zip(world.accelerations, world.variances, strict=True)]
+    n, H, rows = len(models), np.eye(2, 4), []
+    for mean, points in zip(scans.prior_mean, scans.points, strict=True):
+        state = multiple_model.State(
+            np.stack([mean] * n), np.stack([world.prior_cov] * n), multiple_model.log(world.start)
+        )
+        for z in points[:, 0]:
+            state, fused, _ = multiple_model.imm_step(state, z, models, H, world.noise_cov, world.transition)
+            rows.append(fused)
+    return np.reshape(rows, (*scans.mask.shape[:2], 4))
+
+
+def imm_batched(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.batched.multiple_model`."""
+    world = point_world(experiment)
+    G = np.kron([[0.5 * world.dt**2], [world.dt]], np.eye(2))
+    noise = batched.kinematics.piecewise_acceleration(world.variances[:, None], world.dt)
+    models = batched.multiple_model.Models(G @ world.accelerations.T, noise, world.transition)
+    return batched.multiple_model.track(
+        scans.points, scans.mask, scans.prior_mean, world.prior_cov, world.start, world.dt, models, world.noise_cov
+    )
+
+
 REFERENCES: dict[str, Reference] = {
     "vb": Reference(vb_per_run, vb_batched, True),
     "mem_ekf_star": Reference(mem_per_run, mem_batched, True),
+    "multiple_model": Reference(imm_per_run, imm_batched, True),
 }
 """By name of the workload."""

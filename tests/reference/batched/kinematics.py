@@ -31,6 +31,11 @@ def white_acceleration(psd: float, dt: float) -> Noise:
     return Noise(psd * dt**3 / 3.0, psd * dt**2 / 2.0, psd * dt)
 
 
+def piecewise_acceleration(variance: Array, dt: float) -> Noise:
+    """G variance G^T with G = (T^2/2, T) on each axis."""
+    return Noise(variance * dt**4 / 4.0, variance * dt**3 / 2.0, variance * dt**2)
+
+
 def blocks(cov: Array) -> Array:
     """The ten entries of a covariance (4, 4) of x, y, vx, vy."""
     pp, vp, vv = cov[:2, :2], cov[2:, :2], cov[2:, 2:]

@@ -13,10 +13,15 @@ from numpy.typing import NDArray
 
 from emt.config.experiment import Experiment
 from emt.models.motion import PiecewiseAccelerationSettings, WhiteAccelerationSettings
-from tests.reference import batched, mem_ekf_star, multiple_model, vb
+from tests.reference import batched, mem_ekf_star, multiple_model, particle_cloud, vb
+from tests.reference.particle_cloud import RangeBearingWorld
 from tests.reference.worlds import EllipseWorld
 
 Array = NDArray[np.float64]
+PARTICLE_SEED = 20260101
+"""Of the particles' random numbers, which are others than those of the filter."""
+PARTICLE_RUNS = 26
+"""Runs at once of the particle filter: the particles of more of them do not fit the cache."""
 
 
 class Scans(NamedTuple):
@@ -181,9 +186,57 @@ def imm_batched(experiment: Experiment, scans: Scans) -> Array:
     )
 
 
+def range_bearing_world(experiment: Experiment) -> RangeBearingWorld:
+    """What the filters of a point with measured range and bearing are told.
+
+    Raises:
+        ValueError: the experiment starts with an update, or its process noise is another one.
+    """
+    model, dt = experiment.model, experiment.scenario.dt
+    (motion,) = model.named_motions.values()
+    if experiment.start_with != "predict" or not isinstance(motion.noise, WhiteAccelerationSettings):
+        raise ValueError("the references predict before the first scan, under white acceleration")
+    F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
+    Q = motion.noise.psd * np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.eye(2))
+    seen, prior = model.measurement, model.prior
+    return RangeBearingWorld(
+        F, Q, np.array(seen.sensor), seen.range_std, seen.bearing_std, np.array(prior.mean), np.array(prior.cov)
+    )
+
+
+def generators_of(scans: Scans) -> list[np.random.Generator]:
+    """One generator per run, by its place."""
+    return [np.random.default_rng([PARTICLE_SEED, run]) for run in range(len(scans.points))]
+
+
+def particle_per_run(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.particle_cloud`."""
+    world, settings = range_bearing_world(experiment), experiment.filters["particle"]
+    each = zip(scans.points[:, :, 0], generators_of(scans), strict=True)
+    return np.array(
+        [particle_cloud.track(z, rng, world, settings.particles, settings.resample_below) for z, rng in each]
+    )
+
+
+def particle_batched(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.batched.particle`, with the same random numbers."""
+    world, settings, generators = range_bearing_world(experiment), experiment.filters["particle"], generators_of(scans)
+    starts = range(0, len(generators), PARTICLE_RUNS)
+    blocks = [slice(start, start + PARTICLE_RUNS) for start in starts]
+    parts = [
+        batched.particle.track(
+            scans.points[block], scans.mask[block], generators[block], world, settings.particles,
+            settings.resample_below,
+        )
+        for block in blocks
+    ]  # fmt: skip
+    return np.concatenate(parts)
+
+
 REFERENCES: dict[str, Reference] = {
     "vb": Reference(vb_per_run, vb_batched, True),
     "mem_ekf_star": Reference(mem_per_run, mem_batched, True),
     "multiple_model": Reference(imm_per_run, imm_batched, True),
+    "particle": Reference(particle_per_run, particle_batched, False),
 }
 """By name of the workload."""

@@ -21,6 +21,7 @@ RUNS = dict.fromkeys(REFERENCES, 3) | {"particle": 48}
 SHORT = {
     "vb": ("scenario.steps=12",),
     "mem_ekf_star": ("scenario.steps=12",),
+    "moment_ukf": ("scenario.steps=12",),
     "multiple_model": (),
     "particle": ("scenario.steps=10", "filters.particle.particles=2000"),
 }

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from emt.config.experiment import Experiment
 from emt.models.motion import PiecewiseAccelerationSettings, WhiteAccelerationSettings
-from tests.reference import batched, mem_ekf_star, multiple_model, particle_cloud, vb
+from tests.reference import batched, mem_ekf_star, moment_square_root, moment_ukf, multiple_model, particle_cloud, vb
+from tests.reference.moment_square_root import Rules, Straight, Turning
 from tests.reference.particle_cloud import RangeBearingWorld
 from tests.reference.worlds import EllipseWorld
 
@@ -121,6 +122,76 @@ def mem_batched(experiment: Experiment, scans: Scans) -> Array:
         scans.points, scans.mask, ellipse_world(experiment), np.array(settings.shape_cov),
         np.array(settings.shape_noise),
     )  # fmt: skip
+
+
+class MomentModes(NamedTuple):
+    """Settings of interacting image-moment filters, one straight and one turning."""
+
+    moment_cov: Array
+    """Prior covariance of n11, n20, n02 (3, 3) [length^4]."""
+    straight: Straight
+    turning: Turning
+    transition: Array
+    """[i, j]: probability of mode j next, given i now."""
+    rules: Rules
+
+
+def moment_modes(experiment: Experiment) -> MomentModes:
+    """The modes of an experiment.
+
+    Raises:
+        ValueError: they differ in more than their motion.
+    """
+    settings = experiment.filters["ukf_imm"]
+    cv, ct = settings.modes["cv"], settings.modes["ct"]
+    if ct.model_copy(update={"motion": cv.motion}) != cv or settings.likelihood != "average":
+        raise ValueError("the modes must be alike but for their motion, and weighed by the average likelihood")
+    noise, turn = (np.array(mode.motion.moment_noise) for mode in (cv, ct))
+    return MomentModes(
+        np.array(cv.moment_cov),
+        Straight(noise, cv.motion.psd),
+        Turning(turn, ct.motion.acceleration_variance, ct.motion.turn_acceleration_variance),
+        np.array(settings.transition),
+        Rules(
+            np.array(experiment.model.noise_cov), cv.gamma, cv.kappa, cv.beta, cv.projection.floor,
+            cv.projection.ratio, experiment.scenario.dt,
+        ),
+    )  # fmt: skip
+
+
+def moments_per_run(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.moment_square_root`, and the mixing of `tests.reference.moment_ukf`."""
+    world, modes = ellipse_world(experiment), moment_modes(experiment)
+    (mean, cov), rules = moment_square_root.started(world, modes.moment_cov), modes.rules
+
+    def track(points: list[Array]) -> list[Array]:
+        mu, found = np.full(2, 0.5), []
+        states = [(mean[:n], moment_square_root.root_of(cov[:n, :n])) for n in (7, 8)]
+        for y in points:
+            joint = mu[:, None] * modes.transition
+            mu = joint.sum(axis=0)
+            means, covs = [x for x, _ in states], [root @ root.T for _, root in states]
+            mixed = [moment_ukf.merge(joint[:, j] / mu[j], means, covs, 7 + j) for j in range(2)]
+            straight, turning = ((x, moment_square_root.root_of(P)) for x, P in mixed)
+            predicted = [
+                moment_square_root.predict_straight(*straight, modes.straight, rules),
+                moment_square_root.predict_turn(*turning, modes.turning, rules),
+            ]
+            results = [moment_square_root.update(*state, y, rules) for state in predicted]
+            states = [(x, root) for x, root, _ in results]
+            mu = mu * np.exp([average for *_, average in results])
+            mu = mu / mu.sum()
+            overall = mu[0] * states[0][0] + mu[1] * states[1][0][:7]
+            axes, angle = moment_square_root.ellipse_read_out(overall)
+            found.append(np.array([*overall[moment_square_root.KINEMATIC], *axes, angle]))
+        return found
+
+    return run_by_run(track, scans)
+
+
+def moments_batched(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.batched.moment_ukf`."""
+    return batched.moment_ukf.track(scans.points, scans.mask, ellipse_world(experiment), *moment_modes(experiment))
 
 
 class PointWorld(NamedTuple):
@@ -236,6 +307,7 @@ def particle_batched(experiment: Experiment, scans: Scans) -> Array:
 REFERENCES: dict[str, Reference] = {
     "vb": Reference(vb_per_run, vb_batched, True),
     "mem_ekf_star": Reference(mem_per_run, mem_batched, True),
+    "moment_ukf": Reference(moments_per_run, moments_batched, True),
     "multiple_model": Reference(imm_per_run, imm_batched, True),
     "particle": Reference(particle_per_run, particle_batched, False),
 }

@@ -14,7 +14,8 @@ from emt.montecarlo.chunks import Engine
 from emt.montecarlo.program import Program
 from tests.reference import particle
 from tests.reference.particle_cloud import log_likelihood, track
-from tests.reference.workloads import REFERENCES, Scans, generators_of, range_bearing_world
+from tests.reference.settings import range_bearing_world
+from tests.reference.workloads import REFERENCES, Scans, generators_of
 
 SEED = 5
 RUNS = dict.fromkeys(REFERENCES, 3) | {"particle": 48}
@@ -24,6 +25,7 @@ SHORT = {
     "moment_ukf": ("scenario.steps=12",),
     "multiple_model": (),
     "particle": ("scenario.steps=10", "filters.particle.particles=2000"),
+    "shape_mixture": ("scenario.steps=25",),
 }
 """Settings that make a workload small; the legs of `multiple_model` fix its steps."""
 

@@ -12,11 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emt.config.experiment import Experiment
-from emt.models.motion import PiecewiseAccelerationSettings, WhiteAccelerationSettings
-from tests.reference import batched, mem_ekf_star, moment_square_root, moment_ukf, multiple_model, particle_cloud, vb
-from tests.reference.moment_square_root import Rules, Straight, Turning
-from tests.reference.particle_cloud import RangeBearingWorld
-from tests.reference.worlds import EllipseWorld
+from tests.reference import (
+    batched,
+    mem_ekf_star,
+    moment_square_root,
+    moment_ukf,
+    multiple_model,
+    particle_cloud,
+    shape_mixture,
+    vb,
+)
+from tests.reference.settings import connected_world, ellipse_world, moment_modes, point_world, range_bearing_world
 
 Array = NDArray[np.float64]
 PARTICLE_SEED = 20260101
@@ -47,22 +53,6 @@ class Reference(NamedTuple):
     exact: bool
     """Whether the reports are those of the filter but for rounding; if not, its random numbers are others, and the
     reports are alike in distribution."""
-
-
-def ellipse_world(experiment: Experiment) -> EllipseWorld:
-    """What the filters of an ellipse are told.
-
-    Raises:
-        ValueError: the experiment starts with an update, or its process noise is another one.
-    """
-    model, noise = experiment.model, experiment.model.process_noise
-    if experiment.start_with != "predict" or not isinstance(noise, WhiteAccelerationSettings):
-        raise ValueError("the references predict before the first scan, under white acceleration")
-    prior = model.prior
-    return EllipseWorld(
-        experiment.scenario.dt, noise.psd, np.array(model.noise_cov), model.extent_scale, np.array(prior.mean),
-        np.array(prior.cov), prior.orientation, np.array(prior.semi_axes), prior.turn_rate, prior.turn_rate_variance,
-    )  # fmt: skip
 
 
 def run_by_run(track: Callable[[list[Array]], list[Array]], scans: Scans) -> Array:
@@ -124,41 +114,6 @@ def mem_batched(experiment: Experiment, scans: Scans) -> Array:
     )  # fmt: skip
 
 
-class MomentModes(NamedTuple):
-    """Settings of interacting image-moment filters, one straight and one turning."""
-
-    moment_cov: Array
-    """Prior covariance of n11, n20, n02 (3, 3) [length^4]."""
-    straight: Straight
-    turning: Turning
-    transition: Array
-    """[i, j]: probability of mode j next, given i now."""
-    rules: Rules
-
-
-def moment_modes(experiment: Experiment) -> MomentModes:
-    """The modes of an experiment.
-
-    Raises:
-        ValueError: they differ in more than their motion.
-    """
-    settings = experiment.filters["ukf_imm"]
-    cv, ct = settings.modes["cv"], settings.modes["ct"]
-    if ct.model_copy(update={"motion": cv.motion}) != cv or settings.likelihood != "average":
-        raise ValueError("the modes must be alike but for their motion, and weighed by the average likelihood")
-    noise, turn = (np.array(mode.motion.moment_noise) for mode in (cv, ct))
-    return MomentModes(
-        np.array(cv.moment_cov),
-        Straight(noise, cv.motion.psd),
-        Turning(turn, ct.motion.acceleration_variance, ct.motion.turn_acceleration_variance),
-        np.array(settings.transition),
-        Rules(
-            np.array(experiment.model.noise_cov), cv.gamma, cv.kappa, cv.beta, cv.projection.floor,
-            cv.projection.ratio, experiment.scenario.dt,
-        ),
-    )  # fmt: skip
-
-
 def moments_per_run(experiment: Experiment, scans: Scans) -> Array:
     """`tests.reference.moment_square_root`, and the mixing of `tests.reference.moment_ukf`."""
     world, modes = ellipse_world(experiment), moment_modes(experiment)
@@ -194,42 +149,6 @@ def moments_batched(experiment: Experiment, scans: Scans) -> Array:
     return batched.moment_ukf.track(scans.points, scans.mask, ellipse_world(experiment), *moment_modes(experiment))
 
 
-class PointWorld(NamedTuple):
-    """Model of a point that switches between motions at nearly constant velocity."""
-
-    accelerations: Array
-    """Known acceleration of each motion (model, 2) [length/time^2]."""
-    variances: Array
-    """Variance of the acceleration that is held over a step (model,) [length^2/time^4]."""
-    transition: Array
-    """[i, j]: probability of motion j next, given i now."""
-    start: Array
-    """Probabilities before the first prediction (model,)."""
-    noise_cov: Array
-    """Of the measured position (2, 2) [length^2]."""
-    prior_cov: Array
-    """Of x, y, vx, vy (4, 4)."""
-    dt: float
-
-
-def point_world(experiment: Experiment) -> PointWorld:
-    """What the filters of a switching point are told.
-
-    Raises:
-        ValueError: the experiment starts with an update, or its process noise is another one.
-    """
-    model = experiment.model
-    motions = list(model.named_motions.values())
-    piecewise = all(isinstance(motion.noise, PiecewiseAccelerationSettings) for motion in motions)
-    if experiment.start_with != "predict" or not piecewise:
-        raise ValueError("the references predict before the first scan, under piecewise acceleration")
-    return PointWorld(
-        np.array([motion.acceleration for motion in motions]), np.array([motion.noise.variance for motion in motions]),
-        np.array(model.transition_matrix), np.array(model.start_probabilities), np.array(model.measurement.noise_cov),
-        np.array(model.prior.cov), experiment.scenario.dt,
-    )  # fmt: skip
-
-
 def imm_per_run(experiment: Experiment, scans: Scans) -> Array:
     """`tests.reference.multiple_model`."""
     world = point_world(experiment)
@@ -254,24 +173,6 @@ def imm_batched(experiment: Experiment, scans: Scans) -> Array:
     models = batched.multiple_model.Models(G @ world.accelerations.T, noise, world.transition)
     return batched.multiple_model.track(
         scans.points, scans.mask, scans.prior_mean, world.prior_cov, world.start, world.dt, models, world.noise_cov
-    )
-
-
-def range_bearing_world(experiment: Experiment) -> RangeBearingWorld:
-    """What the filters of a point with measured range and bearing are told.
-
-    Raises:
-        ValueError: the experiment starts with an update, or its process noise is another one.
-    """
-    model, dt = experiment.model, experiment.scenario.dt
-    (motion,) = model.named_motions.values()
-    if experiment.start_with != "predict" or not isinstance(motion.noise, WhiteAccelerationSettings):
-        raise ValueError("the references predict before the first scan, under white acceleration")
-    F = np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
-    Q = motion.noise.psd * np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], np.eye(2))
-    seen, prior = model.measurement, model.prior
-    return RangeBearingWorld(
-        F, Q, np.array(seen.sensor), seen.range_std, seen.bearing_std, np.array(prior.mean), np.array(prior.cov)
     )
 
 
@@ -304,11 +205,35 @@ def particle_batched(experiment: Experiment, scans: Scans) -> Array:
     return np.concatenate(parts)
 
 
+def shapes_per_run(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.shape_mixture`.
+
+    Raises:
+        ValueError: steps are not of one second, or the noise differs between the entries of the state.
+    """
+    world = connected_world(experiment)
+    if world.dt != 1.0 or np.ptp(world.q) != 0.0:
+        raise ValueError("the textbook's steps are of one second, with the same noise for all entries")
+
+    def track(points: list[Array]) -> list[Array]:
+        return shape_mixture.random_switch(
+            [y for (y,) in points], world.mean, world.cov, world.sigma2, world.q[0], world.samples
+        )
+
+    return run_by_run(track, scans)
+
+
+def shapes_batched(experiment: Experiment, scans: Scans) -> Array:
+    """`tests.reference.batched.shape_mixture`."""
+    return batched.shape_mixture.track(scans.points, scans.mask, *connected_world(experiment))
+
+
 REFERENCES: dict[str, Reference] = {
     "vb": Reference(vb_per_run, vb_batched, True),
     "mem_ekf_star": Reference(mem_per_run, mem_batched, True),
     "moment_ukf": Reference(moments_per_run, moments_batched, True),
     "multiple_model": Reference(imm_per_run, imm_batched, True),
     "particle": Reference(particle_per_run, particle_batched, False),
+    "shape_mixture": Reference(shapes_per_run, shapes_batched, True),
 }
 """By name of the workload."""

@@ -18,8 +18,8 @@ MAX_BLOCKS = 512
 """Blocks of runs whose sums per step are held at a time."""
 MAX_SUMS = 2**19
 """Sums per step of one metric that are held at a time; very long runs are summed in fewer blocks."""
-GATHERED_BYTES = 16 * 2**20
-"""Memory for the values of the metrics that are gathered at a time; one metric of 1,000,000 runs takes half of it."""
+GATHERED_BYTES = 8 * 2**20
+"""Memory for the values of the metrics that are gathered at a time; one metric of 1,000,000 runs takes it all."""
 SLICE = 2**16
 """Values for which a temporary copy is made at a time."""
 SHOWN_FAILURES = 20

@@ -113,13 +113,15 @@ def window_ratio(
 
 
 def summarise_metric(metric: dict[str, Any], results: FilterResults, column: int, first_step: int) -> dict[str, Any]:
-    """value, se, std, median and runs_used of one metric; None where the runs do not allow a number."""
+    """value, se, std, median and runs_used of one metric; None where the runs do not allow a number.
+
+    The values of the metric are in another order afterwards.
+    """
     values = results.values[column]
     n = len(values)
     std = math.sqrt(variance_of(values)) if n > 1 else math.nan
     value = se = median = math.nan
     if n:
-        median = float(np.median(values))
         match metric["over_runs"]:
             case "mean":
                 value, se = float(np.mean(values)), std / math.sqrt(n)
@@ -138,6 +140,7 @@ def summarise_metric(metric: dict[str, Any], results: FilterResults, column: int
                 value = share_in_band(results, column, first_step, metric["dof"])
             case _:
                 value, se = rms_over_runs(results, column, first_step)
+        median = float(np.median(values, overwrite_input=True))  # the last to look at them: no copy
     numbers = {"value": value, "se": se, "std": std, "median": median}
     return {k: (v if math.isfinite(v) else None) for k, v in numbers.items()} | {"runs_used": n}
 
@@ -167,6 +170,7 @@ def summarise(reader: RunReader) -> dict[str, Any]:
                 if metric["over_runs"] in RULES:
                     numbers = segment_numbers(stretches, results.step_sum[..., k], results.step_count, metric)
                     segments[label][metric["name"]] = numbers
+            del results  # before the next ones are gathered
         flags[label] = run_flags(reader, label)
     return {
         "experiment": identity["experiment"],

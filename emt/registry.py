@@ -127,6 +127,10 @@ class Registry(Generic[T]):
         self._loaded[name] = entry = _load(name, target)
         return entry
 
+    def forget(self) -> None:
+        """Drops the plug-ins imported so far; those that are asked for again are looked up again."""
+        self._loaded.clear()
+
     def _installed(self) -> dict[str, list[metadata.EntryPoint]]:
         if self._plugins is None:
             self._plugins = {}

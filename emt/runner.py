@@ -1,18 +1,19 @@
 """Runs an experiment into a folder: chunk by chunk, resumable, with what the tables and figures need at the end."""
 
-import hashlib
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
+from emt.cluster.pool import Pool
+from emt.cluster.source import ChunkSource
 from emt.config.errors import ConfigError
 from emt.config.load import Loaded, problem_at
 from emt.device import configure, environment
 from emt.montecarlo.chunks import Engine, without_tracks
+from emt.montecarlo.identity import identity_of
 from emt.montecarlo.program import Program
 from emt.montecarlo.run import mode_names
 from emt.reports.connected_art import animation, is_connected
@@ -33,8 +34,6 @@ FEWEST_MODES = 3
 """Of the filter with most, for a figure of mode probabilities; those of two modes fit among the metrics."""
 LONGEST_QUICK = 500
 """Steps of a run up to which a program compiled in a hurry saves time."""
-SHORT_SECONDS = 3.0
-"""Experiments that take less are computed again for the record of costs."""
 
 
 class Progress(NamedTuple):
@@ -126,14 +125,9 @@ def modes_of(program: Program) -> dict[str, list[str]]:
 
 def manifest_of(loaded: Loaded, program: Program) -> dict[str, Any]:
     """What is recorded with results: the identity they depend on, and what readers need to show them."""
-    identity, experiment = loaded.identity(), loaded.experiment
-    if hasattr(experiment.scenario, "path"):
-        digest = hashlib.sha256()
-        for leaf in jax.tree.leaves(program.world.scenario):
-            digest.update(np.asarray(leaf).tobytes())
-        identity["recording_sha256"] = digest.hexdigest()
+    experiment = loaded.experiment
     return {
-        "identity": identity,
+        "identity": identity_of(loaded, program),
         "environment": environment(),
         "metrics": metric_facts(program),
         "filters": list(experiment.filters),
@@ -158,6 +152,7 @@ def run(
     figures: bool = True,
     quick: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    pool: Pool | None = None,
 ) -> dict[str, Any]:
     """Runs what is missing of an experiment and writes summary, tables and figures; returns the summary.
 
@@ -167,10 +162,12 @@ def run(
         more: number of runs to add to those in the folder, instead.
         figures: whether figures are drawn beside the tables.
         quick: whether programs are compiled in a hurry, for a few runs that are not long.
+        pool: workers that compute instead of this process; the results are the same.
 
     Raises:
         ConfigError: the recording cannot be used.
         StoreError: the folder cannot be used, or belongs to another configuration.
+        ClusterError: the pool cannot compute.
     """
     program = build_program(loaded)
     labels, chunk_size = list(loaded.experiment.filters), loaded.experiment.chunk_size
@@ -181,29 +178,19 @@ def run(
         else:
             total = loaded.experiment.monte_carlo.runs if runs is None else runs
         missing = folder.missing(total, chunk_size)
-        quick = quick and program.n_steps <= LONGEST_QUICK
-        engine = Engine(program, loaded.experiment.monte_carlo.seed, chunk_size, quick=quick)
+        source = ChunkSource(loaded, program, pool, quick=quick and program.n_steps <= LONGEST_QUICK)
         running = Running()
         for chunk in folder.chunks():
             running.add(labels, folder.read_chunk(chunk))  # a damaged chunk is found before anything is computed
-        started = time.perf_counter()
 
         def tell(stage: str, detail: str, done: int, rate: float = 0.0) -> None:
             on_progress(Progress(stage, detail, done, max(total, done), rate, running.state()))
 
-        timing: dict[str, Any] = {}
         first_run: dict[str, np.ndarray] = {}
         if missing:
-            names: list[str] = []
-
-            def on_start(name: str) -> None:
-                names.append(name)
-                tell("compiling", ", ".join(names[-2:]), present)
-
-            engine.compile(on_start)
-            timing["compile_seconds"] = time.perf_counter() - started
+            source.prepare(lambda detail: tell("compiling", detail, present))
         began, done = time.perf_counter(), present
-        for number, (start, stop, arrays) in enumerate(engine.run_chunks(missing), start=1):
+        for number, (start, stop, arrays) in enumerate(source.chunks(missing), start=1):
             if start == 0:
                 first_run = {name: array[:1] for name, array in arrays.items()}
             if not loaded.experiment.traces:
@@ -211,18 +198,14 @@ def run(
             folder.write_chunk(start, stop, arrays)
             running.add(labels, arrays)
             done += stop - start
-            elapsed = time.perf_counter() - began
-            tell("running", f"chunk {number}/{len(missing)}", done, (done - present) / elapsed)
-            timing["run_seconds"], timing["runs"] = elapsed, done - present
-        if timing and timing["run_seconds"] < SHORT_SECONDS and len(missing) < 3:
-            for _ in range(2):  # the first chunk of a process is slower than the others
-                engine.run_chunk(*missing[0])
-        if timing:
-            timing["microseconds_per_run_and_step"] = engine.costs()
+            rate = (done - present) / (time.perf_counter() - began)
+            tell("running", f"chunk {number}/{len(missing)}", done, rate)
+        seconds = time.perf_counter() - began
+        timing = source.timing(missing, seconds) | {"run_seconds": seconds, "runs": done - present} if missing else {}
         tell("reporting", "tables and figures", done)
         if figures and not first_run and not (folder.path / TRACK_FIGURE).exists():
-            engine.compile()
-            first_run = engine.run_chunk(0, 1, tracked=1)
+            source.prepare()
+            ((_, _, first_run),) = source.chunks([(0, 1)])
         summary = write_reports(folder)
         if figures:
             write_figures(folder, first_run)

@@ -1,5 +1,6 @@
 """`emt run`, `emt reproduce`, `emt table`, `emt replay`."""
 
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -42,11 +43,16 @@ def run(
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, instead of the configuration's.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Runs in all, instead of the configuration's.")] = None,
     more: Annotated[int, typer.Option(min=0, help="Runs to add to a finished folder.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Worker processes to start on this machine.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A running Dask scheduler, instead: tcp://HOST:PORT.")
+    ] = None,
 ) -> None:
     """Run an experiment, or continue it where it stopped; ends with its table.
 
     The folder keeps every finished chunk of runs: after an interruption the same command continues, and
-    --more extends what is there. Another configuration needs another folder.
+    --more extends what is there. Another configuration needs another folder. With workers, or without, the
+    results are the same.
 
     Example: emt run tuncer2021/trajectory_uniform monte_carlo.runs=200 filters.vb.iterations=5 --out results/vb5
     """
@@ -57,7 +63,8 @@ def run(
     changes += [f"monte_carlo.seed={seed}"] * (seed is not None) + [f"monte_carlo.runs={runs}"] * (runs is not None)
     loaded = load_experiment(config, changes)
     folder = Path("results") / loaded.name if out is None else out
-    summary = run_shown(loaded, folder, more=more)
+    with pool_of(workers, scheduler) as pool:
+        summary = run_shown(loaded, folder, more=more, pool=pool)
     unit = loaded.experiment.length_unit
     if summary["metrics"]:
         typer.echo(summary_table(summary, unit).render("text"), nl=False)
@@ -73,8 +80,34 @@ def run(
         raise typer.Exit(CHECK_FAILED)
 
 
+@contextmanager
+def pool_of(workers: int | None, scheduler: str | None):
+    """The workers asked for, None if there are none; says where to watch them."""
+    if workers is None and scheduler is None:
+        yield None
+        return
+    if workers is not None and scheduler is not None:
+        raise UnusableError("give either --workers or --scheduler: a scheduler brings its own workers")
+    from emt.cluster.connecting import open_pool
+    from emt.cluster.pool import ClusterError
+
+    try:
+        with open_pool(workers=workers, scheduler=scheduler) as pool:
+            say(f"dashboard: {pool.dashboard}" if pool.dashboard else f"scheduler: {pool.address}")
+            yield pool
+    except ClusterError as error:
+        raise UnusableError(str(error)) from error
+
+
 def run_shown(
-    loaded, folder: Path, *, more: int = 0, runs: int | None = None, figures: bool = True, quick: bool = False
+    loaded,
+    folder: Path,
+    *,
+    more: int = 0,
+    runs: int | None = None,
+    figures: bool = True,
+    quick: bool = False,
+    pool=None,
 ):
     """Runs an experiment under a live view; an interruption becomes a message that says how to go on."""
     from emt.cli.display import LiveView
@@ -90,7 +123,7 @@ def run_shown(
                 last = progress
                 view.update(progress)
 
-            options = {"figures": figures, "quick": quick, "on_progress": update}
+            options = {"figures": figures, "quick": quick, "on_progress": update, "pool": pool}
             return run_experiment(loaded, folder, runs=runs, more=more, **options)
     except KeyboardInterrupt:
         kept = f"{last.done} of {last.total}" if last is not None else "all finished"

@@ -1,94 +1,197 @@
-"""`emt bench`: what a run and step costs, part by part, in one process."""
+"""`emt bench`: what emt costs, beside other ways to compute the same."""
 
-import resource
-import statistics
-import time
-from typing import Annotated
+import json
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-ALONE = ", filter only, one run alone"
+from emt.cli.errors import CHECK_FAILED, UnusableError, say
+
+WHOLE = ("scaling", "reproduce")
+"""Workloads that run commands; they take minutes and have to be named."""
 
 
 def bench(
-    configs: Annotated[
-        list[str] | None, typer.Argument(metavar="[CONFIG|PAPER]...", help="Experiments to time, or papers.")
+    workloads: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[WORKLOAD|CONFIG|PAPER]...", help="What to time; by default the six standard workloads."
+        ),
     ] = None,
+    peers: Annotated[bool, typer.Option("--peers", help="Also time filters of other, installed packages.")] = False,
     repetitions: Annotated[int, typer.Option(min=1, help="Interleaved repetitions; the median counts.")] = 7,
+    runs: Annotated[
+        str, typer.Option(metavar="N,N,...", help="Numbers of runs of `scaling`.")
+    ] = "1000,10000,100000,1000000",
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything there.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Write benchmark.md there.")] = None,
 ) -> None:
-    """Time simulation, filters, and filters with metrics, per run and step, interleaved in one process.
+    """Time the standard workloads, each beside NumPy, plain JAX and other packages that compute the same.
 
-    Filters are timed on a whole chunk of runs and on a single run alone.
+    The workloads are vb, mem_ekf_star, moment_ukf, shape_mixture, multiple_model and particle; `scaling` runs one of
+    them with up to a million runs, and `reproduce` is the whole of `emt reproduce`. These two take minutes and have to
+    be named. Any other experiment, or paper, is timed part by part.
 
-    Example: emt bench tuncer2021/trajectory_uniform
+    Example: emt bench vb mem_ekf_star --peers --json bench.json
     """
-    from emt.config.load import load_experiment
+    from emt.benchmark.clock import blas_on_one_thread
+
+    blas_on_one_thread()  # before NumPy is loaded
+    sizes = sizes_of(runs)
+    standard, whole, experiments = sorted_out(workloads or [])
+    for option, place in (("--json", json_file), ("--report", report)):
+        check_place(option, place)
+    results: dict[str, Any] = {"workloads": {}, "scaling": None, "reproduce": None, "parts": {}}
+    results |= measure_workloads(results["workloads"], standard, repetitions, peers)
+    measure_whole(results, whole, sizes)
+    show(results, experiments, repetitions)
+    if json_file is not None:
+        write(json_file, json.dumps(results, indent=2, ensure_ascii=False) + "\n")
+        say(f"measurements: {json_file}")
+    if report is not None:
+        from emt.benchmark.report import markdown
+
+        write(report / "benchmark.md", markdown(results))
+        say(f"report: {report / 'benchmark.md'}")
+
+
+def sorted_out(names: list[str]) -> tuple[list[str], list[str], list[str]]:
+    """Standard workloads, whole commands, and experiments among what is asked for.
+
+    Raises:
+        UnusableError: a name is none of them.
+    """
+    from emt.benchmark.goals import WORKLOADS
     from emt.config.shipped import config_names, papers
-    from emt.reports.paper import published_of
-    from emt.reports.table import Column, Table
-    from emt.runner import build_program
+    from emt.registry import suggest
 
-    columns = [
-        Column("part", "part"),
-        Column("us", "µs per run and step", True),
-        Column("ratio", "ratio", True),
-        Column("compile", "compile s", True),
-    ]
-    names: list[str] = []
-    for name in configs or ["tuncer2021/trajectory_uniform"]:
-        published = published_of(name) if name in papers() else None
-        listed = published.benchmarks if published else ()
-        names += [*(listed or config_names(name))] if name in papers() else [name]
+    known = [*WORKLOADS, *WHOLE]
     for name in names:
-        loaded = load_experiment(name)
-        parts, compile_seconds = timed_parts(build_program(loaded), loaded)
-        samples: dict[str, list[float]] = {part: [] for part in parts}
-        for _ in range(repetitions):
-            for part, call in parts.items():
-                started = time.perf_counter()
-                call()
-                samples[part].append(time.perf_counter() - started)
-        medians = {part: statistics.median(times) for part, times in samples.items()}
-        n_steps, chunk = getattr(loaded.experiment.scenario, "n_steps", 1), loaded.experiment.chunk_size
-        fastest = min(seconds for part, seconds in medians.items() if not part.endswith(ALONE))
-        rows = [
-            {
-                "part": part,
-                "us": f"{1e6 * seconds / (n_steps * (1 if part.endswith(ALONE) else chunk)):.2f}",
-                "ratio": "" if part.endswith(ALONE) else f"{seconds / fastest:.1f}",
-                "compile": f"{compile_seconds[part]:.1f}",
-            }
-            for part, seconds in medians.items()
-        ]
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        note = f"wall clock, median of {repetitions}, {loaded.experiment.chunk_size} runs; peak memory {peak:.0f} MiB"
-        typer.echo(Table(loaded.name, columns, rows, rows, [note]).render("text"))
+        if name in known or name in papers() or name in config_names() or is_file_name(name):
+            continue
+        near = suggest(name, [*known, *papers(), *config_names()])
+        hint = f" (did you mean '{near}'?)" if near else ""
+        raise UnusableError(f"unknown workload '{name}'{hint}; known: {', '.join(known)}, experiments and papers")
+    names = list(dict.fromkeys(names))
+    standard: list[str] = [name for name in WORKLOADS if not names or name in names]
+    return standard, [name for name in WHOLE if name in names], [name for name in names if name not in known]
 
 
-def timed_parts(program, loaded):
-    """Calls that compute one chunk of each part and wait for it, compiled; with their compile times."""
-    import dataclasses
+def is_file_name(name: str) -> bool:
+    """Whether a text means a configuration file, which need not exist: reading it says what is wrong."""
+    return Path(name).suffix in (".yaml", ".yml") or Path(name).exists()
 
-    import jax
-    import jax.numpy as jnp
 
-    seed = jnp.asarray(loaded.experiment.monte_carlo.seed)
-    runs = jnp.arange(loaded.experiment.chunk_size)
-    bare = dataclasses.replace(program, metrics=())
-    compile_seconds, calls = {}, {}
+def sizes_of(text: str) -> list[int]:
+    """Numbers of runs, in the order given.
 
-    def add(part, function, arguments):
-        started = time.perf_counter()
-        compiled = function.lower(*arguments).compile()
-        compile_seconds[part] = time.perf_counter() - started
-        calls[part] = lambda: jax.block_until_ready(compiled(*arguments))
-        return calls[part]()
+    Raises:
+        UnusableError: not positive numbers.
+    """
+    try:
+        sizes = [int(part) for part in text.split(",")]
+    except ValueError:
+        sizes = []
+    if not sizes or min(sizes) < 1:
+        raise UnusableError(f"--runs {text}: expected numbers of runs such as 1000,10000")
+    return sizes
 
-    simulation = add("simulation", program.simulator(), (program.world, seed, runs))
-    for label in loaded.experiment.filters:
-        arguments = (program.world, program.filter_params[label], seed, runs, simulation.scans, simulation.truth)
-        add(f"{label}, filter only", bare.scorer(label), arguments)
-        add(f"{label}, with metrics", program.scorer(label), arguments)
-        first = jax.tree.map(lambda leaf: leaf[:1], (simulation.scans, simulation.truth))
-        add(f"{label}{ALONE}", bare.scorer(label), (*arguments[:3], runs[:1], *first))
-    return calls, compile_seconds
+
+def check_place(option: str, place: Path | None) -> None:
+    """Makes sure that results can be written before they are measured; makes the folder of a report.
+
+    Raises:
+        UnusableError: they cannot.
+    """
+    import os
+
+    if place is None:
+        return
+    folder = place.parent if option == "--json" else place
+    try:
+        if option == "--report":
+            folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnusableError(f"{option} {place}: cannot be made: {error.strerror or error}") from error
+    if not folder.is_dir():
+        raise UnusableError(f"{option} {place}: there is no folder {folder}")
+    if (option == "--json" and place.is_dir()) or not os.access(folder, os.W_OK):
+        raise UnusableError(f"{option} {place}: cannot be written")
+
+
+def measure_workloads(found: dict[str, Any], names: list[str], repetitions: int, peers: bool) -> dict[str, Any]:
+    """Measures the standard workloads into `found`, shows each, and returns what is known of all."""
+    from emt.benchmark import measure, peak, processes, report
+    from emt.benchmark.clock import one_core
+    from emt.benchmark.rivals import DisagreementError
+
+    if not names:
+        return measure.circumstances(repetitions, None, None) | {"help_seconds": None}
+    try:
+        with one_core() as core:
+            fastest = peak.measured_peak()
+            for name in names:
+                options = {"repetitions": repetitions, "peers": peers, "peak": fastest.flops, "tell": say}
+                found[name] = measure.measure(name, **options)
+                typer.echo(report.workload_table(found[name]).render("text"))
+            help_seconds = processes.help_seconds()
+    except DisagreementError as error:
+        say(str(error))
+        raise typer.Exit(CHECK_FAILED) from error
+    except processes.ChildError as error:
+        raise UnusableError(str(error)) from error
+    return measure.circumstances(repetitions, core, fastest) | {"help_seconds": help_seconds}
+
+
+def measure_whole(results: dict[str, Any], names: list[str], sizes: list[int]) -> None:
+    """Measures whole commands into `results`."""
+    if not names:
+        return
+    from emt.benchmark.processes import ChildError
+    from emt.benchmark.reproducing import reproduced
+    from emt.benchmark.scaling import scaling
+
+    try:
+        if "scaling" in names:
+            results["scaling"] = rows = []
+            for row in scaling(sizes):
+                rows.append(row)
+                say(f"scaling: {row['runs']} runs in {row['wall']:.1f} s, {row['memory']:.0f} MiB")
+        if "reproduce" in names:
+            results["reproduce"] = reproduced(tell=say)
+    except ChildError as error:
+        raise UnusableError(str(error)) from error
+
+
+def show(results: dict[str, Any], experiments: list[str], repetitions: int) -> None:
+    """Judges and shows what was measured; times the experiments that are no workloads."""
+    from emt.benchmark.goals import verdicts
+    from emt.benchmark.report import method_of, tables_of
+
+    results["goals"] = verdicts(results)
+    for part in tables_of(results):
+        typer.echo(part.render("text"))
+    if results["workloads"]:
+        typer.echo("\n".join(method_of(results)))
+    if experiments:
+        from emt.benchmark.parts import experiments_of, parts_table
+
+        for name in [one for given in experiments for one in experiments_of(given)]:
+            part = parts_table(name, repetitions)
+            results["parts"][name] = list(part.values)
+            typer.echo(part.render("text"))
+
+
+def write(path: Path, text: str) -> None:
+    """Writes a file in one step.
+
+    Raises:
+        UnusableError: it cannot be written.
+    """
+    from emt.store.files import FileSystem, write_atomically
+
+    try:
+        write_atomically(FileSystem(), path, text.encode("utf-8"))
+    except OSError as error:
+        raise UnusableError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -39,13 +39,11 @@ def open_pool(*, workers: int | None = None, scheduler: str | None = None) -> Po
         raise ClusterError(f"several processes need {' and '.join(missing)}: pip install 'emt[cluster]'")
     with ExitStack() as stack:
         stack.enter_context(quiet())
-        if scheduler is not None:
-            client = stack.enter_context(connected(scheduler))
-            return Pool(client, scheduler, client.dashboard_link or "", stack.pop_all())
-        cluster = stack.enter_context(local_workers(workers or 1))
+        cluster = scheduler if scheduler is not None else stack.enter_context(local_workers(workers or 1))
         client = stack.enter_context(connected(cluster))
-        dashboard = cluster.dashboard_link if is_installed("bokeh") else ""
-        return Pool(client, cluster.scheduler_address, dashboard, stack.pop_all())
+        # without bokeh the page of the dashboard only says that bokeh is missing
+        dashboard = client.dashboard_link if is_installed("bokeh") else None
+        return Pool(client, client.scheduler.address, dashboard or "", stack.pop_all())
 
 
 def is_installed(name: str) -> bool:

@@ -13,6 +13,8 @@ PER_THREAD = 4
 """Chunks handed out per thread of a worker: enough that none waits, few enough to hold the results in memory."""
 FEWEST = 4
 """Chunks handed out while there is no worker yet."""
+AT_ONCE = 16
+"""Results that are fetched together, for the time on the way."""
 LOOK_SECONDS = 1.0
 """Time after which workers are counted again."""
 KEPT = "finished chunks are kept, and the same command continues"
@@ -69,14 +71,10 @@ class Pool:
                     future.add_done_callback(ready.put)
                 if not flying:
                     return
-                try:
-                    future = ready.get(timeout=LOOK_SECONDS)
-                except queue.Empty:
-                    continue
-                start, stop = flying[future]
-                result = self._result(future, start, stop)
-                del flying[future], future  # so that its worker forgets it, too
-                yield start, stop, result
+                # not too many, or workers would run out of chunks while these are stored
+                done = taken(ready, min(self._places // PER_THREAD, AT_ONCE))
+                yield from self._fetched({future: flying.pop(future) for future in done})
+                del done  # so that workers forget them, too
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel(list(flying), force=True)
@@ -85,6 +83,15 @@ class Pool:
         from emt.cluster.tasks import compute
 
         return self._client.submit(compute, parcel, start, stop, int(start == 0), pure=False, retries=0)
+
+    def _fetched(self, done: dict[Any, tuple[int, int]]) -> Iterator[tuple[int, int, Any]]:
+        """Chunks that are ready: fetched together or, if one of them failed, one after the other until it comes."""
+        try:
+            results = self._client.gather(list(done))
+        except Exception:
+            results = (self._result(future, start, stop) for future, (start, stop) in done.items())
+        for (start, stop), result in zip(done.values(), results, strict=True):
+            yield start, stop, result
 
     def _result(self, future: Any, start: int, stop: int) -> Any:
         from distributed import KilledWorker
@@ -118,3 +125,13 @@ class Pool:
             self._places = max(PER_THREAD * sum(self._threads().values()), FEWEST)
             self._looked = time.monotonic()
         return self._places
+
+
+def taken(ready: "queue.SimpleQueue[Any]", most: int) -> list[Any]:
+    """Waits for the first of a queue, though not long, and takes along what else is there."""
+    found = []
+    with suppress(queue.Empty):
+        found.append(ready.get(timeout=LOOK_SECONDS))
+        while len(found) < most:
+            found.append(ready.get_nowait())
+    return found

@@ -35,7 +35,8 @@ class ChunkSource:
         """Compiles if the chunks are computed here, with a word on what is compiled; workers do so on their own."""
         if self._pool is not None:
             workers = self._pool.workers()
-            on_start(f"{workers} workers" if workers else f"waiting for workers at {self._pool.address}")
+            counted = f"{workers} worker{'s' * (workers > 1)}"
+            on_start(counted if workers else f"waiting for workers at {self._pool.address}")
             return
         names: list[str] = []
 

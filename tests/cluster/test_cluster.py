@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -180,13 +181,13 @@ def test_workers_of_a_running_scheduler(alone, tmp_path, cache):
     scheduler = dask("dask_scheduler", "--host", "127.0.0.1", "--port", address.split(":")[-1], "--no-dashboard")
     worker = None
     try:
-        time.sleep(3.0)
+        wait_for_server(int(address.split(":")[-1]))
         first = emt("--out", out)
-        time.sleep(3.0)
+        assert first.stderr is not None
+        assert any(f"waiting for workers at {address}" in line for line in first.stderr)  # reads no further
         worker = dask("dask_worker", address, "--nthreads", "1")
-        _, err = first.communicate(timeout=120)
+        _, err = first.communicate(timeout=300)
         assert first.returncode == 0, err
-        assert f"waiting for workers at {address}" in err
         assert results(out) == expected
         second = emt("--runs", "400000", "--out", tmp_path / "other")
         wait_for_chunks(tmp_path / "other", 3, second)
@@ -202,10 +203,19 @@ def test_workers_of_a_running_scheduler(alone, tmp_path, cache):
                 process.wait()
 
 
+def wait_for_server(port: int) -> None:
+    """Returns when somebody listens at a port of this machine."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port)).close()
+        except OSError:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+
 def free_port() -> int:
     """A port of this machine that is free now."""
-    import socket
-
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         return server.getsockname()[1]

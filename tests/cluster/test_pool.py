@@ -45,6 +45,9 @@ class FakeClient:
         self.most = max(self.most, len(self.flying))
         return future
 
+    def gather(self, futures):
+        return [future.result() for future in futures]
+
     def cancel(self, futures, force):
         self.cancelled += futures
 

@@ -44,7 +44,11 @@ def compile_costs(name: str, cache: Path, overrides: Sequence[str] = ()) -> dict
     """
     command = [sys.executable, "-m", "emt.benchmark.compiling", name, *overrides]
     environment = os.environ | {"EMT_CACHE": str(cache)}
-    return {state: json.loads(run_child(command, environment).splitlines()[-1]) for state in ("cold", "warm")}
+    costs = {}
+    for state in ("cold", "warm"):
+        printed = run_child(f"compilation of {name}", command, environment)
+        costs[state] = json.loads(printed.splitlines()[-1])
+    return costs
 
 
 if __name__ == "__main__":

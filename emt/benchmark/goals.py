@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from emt.benchmark.rivals import BATCHED, PLAIN
+from emt.benchmark.workloads import WORKLOADS
 from emt.reports.numbers import significant
 from emt.reports.table import Column, Table
 
@@ -66,7 +67,6 @@ def faster(workload: str, rival: str, bound: float, name: str) -> Goal:
     return Goal(workload, f"{workload}, filter only: faster than {name}", bound, True, times_faster(workload, rival))
 
 
-WORKLOADS = ("vb", "mem_ekf_star", "moment_ukf", "shape_mixture", "multiple_model", "particle")
 GOALS = (
     faster("vb", "pyrecest VBRMTracker", 5000.0, "PyRecEst's VBRMTracker"),
     faster("vb", BATCHED, 8.0, BATCHED),

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from emt.benchmark.clock import BLAS_THREADS
+
 COMMAND = "import sys; sys.argv[0] = 'emt'; from emt.cli.main import main; main()"
 """The command `emt`, for the interpreter that runs this."""
 WATCHED = """import sys
@@ -43,8 +45,13 @@ def peak_memory() -> float:
     return float("nan")
 
 
-def run_child(command: Sequence[str], environment: Mapping[str, str] | None = None) -> str:
-    """Standard output of a process.
+def as_started_by_users() -> dict[str, str]:
+    """The environment without the bounds that `clock` sets for this process."""
+    return {name: value for name, value in os.environ.items() if name not in BLAS_THREADS}
+
+
+def run_child(name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> str:
+    """Standard output of a process, which is called `name` where it fails.
 
     Raises:
         ChildError: its exit code is not 0.
@@ -52,7 +59,7 @@ def run_child(command: Sequence[str], environment: Mapping[str, str] | None = No
     done = subprocess.run(command, env=environment, text=True, capture_output=True)
     if done.returncode:
         last = "\n".join(done.stderr.strip().splitlines()[-5:])
-        raise ChildError(f"{' '.join(command[1:])} ended with code {done.returncode}: {last}")
+        raise ChildError(f"{name} ended with code {done.returncode}: {last}")
     return done.stdout
 
 
@@ -65,6 +72,6 @@ def help_seconds(attempts: int = 5) -> float:
     best = float("inf")
     for _ in range(attempts):
         started = time.perf_counter()
-        run_child([sys.executable, "-c", COMMAND, "--help"], os.environ)
+        run_child("emt --help", [sys.executable, "-c", COMMAND, "--help"], as_started_by_users())
         best = min(best, time.perf_counter() - started)
     return best

@@ -1,7 +1,6 @@
 """The whole of `emt reproduce` with nothing compiled before: how long it takes, and for what."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -11,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from emt.benchmark.processes import COMMAND, ChildError
+from emt.benchmark.processes import COMMAND, ChildError, as_started_by_users
 from emt.reports.paper import TIMING_FILE
 from emt.reports.table import Column, Table
 
@@ -41,7 +40,7 @@ def reproduced(
         folder = Path(temporary)
         out, printed = folder / "results", folder / "printed.txt"
         command = [sys.executable, "-c", COMMAND, "reproduce", *papers, "--scale", scale, "--out", str(out)]
-        environment = os.environ | {"EMT_CACHE": str(folder / "cache")}
+        environment = as_started_by_users() | {"EMT_CACHE": str(folder / "cache")}
         started = time.perf_counter()
         with (
             printed.open("w") as stdout,

@@ -1,7 +1,6 @@
 """`emt run` at growing numbers of runs, each in a process of its own: time and memory."""
 
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -9,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from emt.benchmark.processes import WATCHED, ChildError, run_child
+from emt.benchmark.processes import WATCHED, ChildError, as_started_by_users, run_child
 from emt.reports.paper import TIMING_FILE
 from emt.reports.table import Column, Table
 
@@ -31,7 +30,9 @@ def one_size(runs: int, overrides: Sequence[str] = ()) -> dict[str, Any]:
         out, told = Path(folder) / "results", Path(folder) / "memory"
         command = ["run", EXPERIMENT, *overrides, "--runs", str(runs), "--out", str(out)]
         started = time.perf_counter()
-        run_child([sys.executable, "-c", WATCHED, str(told), *command], os.environ)
+        run_child(
+            f"emt {' '.join(command)}", [sys.executable, "-c", WATCHED, str(told), *command], as_started_by_users()
+        )
         wall = time.perf_counter() - started
         try:
             timing, memory = json.loads((out / TIMING_FILE).read_text(encoding="utf-8")), float(told.read_text())

@@ -62,7 +62,7 @@ def sorted_out(names: list[str]) -> tuple[list[str], list[str], list[str]]:
     Raises:
         UnusableError: a name is none of them.
     """
-    from emt.benchmark.goals import WORKLOADS
+    from emt.benchmark.workloads import WORKLOADS
     from emt.config.shipped import config_names, papers
     from emt.registry import suggest
 
@@ -135,7 +135,7 @@ def measure_workloads(found: dict[str, Any], names: list[str], repetitions: int,
                 options = {"repetitions": repetitions, "peers": peers, "peak": fastest.flops, "tell": say}
                 found[name] = measure.measure(name, **options)
                 typer.echo(report.workload_table(found[name]).render("text"))
-            help_seconds = processes.help_seconds()
+        help_seconds = processes.help_seconds()
     except DisagreementError as error:
         say(str(error))
         raise typer.Exit(CHECK_FAILED) from error

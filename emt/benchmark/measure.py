@@ -99,6 +99,7 @@ def compared(rival: Rival, cost: Cost, agreed: Agreement, steps: int, own: dict[
         "difference": agreed.difference,
         "standard_error": agreed.standard_error,
         "agreement": agreed.text(),
+        "remark": rival.remark,
     }
 
 

@@ -49,8 +49,8 @@ def workload_table(found: Mapping[str, Any]) -> Table:
 
 
 def notes_of(found: Mapping[str, Any]) -> list[str]:
-    """Compilation, memory and rate in words."""
-    notes = []
+    """Compilation, memory and rate in words, and remarks on rivals."""
+    notes = [rival["remark"] for rival in found["rivals"] if rival["remark"]]
     if "compile" in found:
         cold, warm = found["compile"]["cold"], found["compile"]["warm"]
         notes.append(
@@ -110,7 +110,8 @@ def method_of(results: Mapping[str, Any]) -> list[str]:
         )
     return [
         f"Times are medians of {results['repetitions']} interleaved repetitions in one process, {place}: CPU time of "
-        f"all its threads, wall clock beside it. Calls of more than {LONG_SECONDS:.0f} s are repeated {FEWEST} times.",
+        f"all its threads, wall clock beside it. Calls of more than {LONG_SECONDS:.0f} s are repeated at most {FEWEST} "
+        "times.",
         "All are given the same simulated scans, and every rival is checked before it is timed: its largest relative "
         "difference from emt is shown (or that of position errors, where random numbers differ). Ratios are of CPU "
         "times per run and step. Compilation is tracing, lowering and compiling simulator and filter in a process of "

@@ -120,7 +120,9 @@ def test_rivals_agree_and_are_compared():
 def test_a_rival_that_computes_something_else():
     bench = small()
     (rival, *_), _ = rivals.rivals_of(bench, peers=False)
-    wrong = np.asarray(rival.call()) * (1.0 + 1e-6)
+    right = np.asarray(rival.call())
+    wrong, turned = right * (1.0 + 1e-6), right - [0, 0, 0, 0, 0, 0, np.pi]
+    assert rivals.agreement(rival._replace(call=lambda: turned), bench).difference < 1e-9
     with pytest.raises(DisagreementError, match="vb: batched NumPy does not report"):
         rivals.agreement(rival._replace(call=lambda: wrong), bench)
     with pytest.raises(DisagreementError, match="reports"):

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 
 from emt.benchmark.clock import interleaved, timed
 from emt.benchmark.processes import peak_memory
+from emt.benchmark.workloads import options_of
 from emt.config.load import Loaded, load_experiment
 from emt.config.shipped import config_names, papers
+from emt.montecarlo.chunks import Engine
 from emt.montecarlo.program import Program
 from emt.reports.paper import published_of
 from emt.reports.table import Column, Table
@@ -63,11 +65,12 @@ def timed_parts(program: Program, loaded: Loaded) -> tuple[dict[str, Callable[[]
     seed = jnp.asarray(loaded.experiment.monte_carlo.seed)
     runs = jnp.arange(loaded.experiment.chunk_size)
     bare = dataclasses.replace(program, metrics=())
+    options = options_of(Engine(program, loaded.experiment.monte_carlo.seed, loaded.experiment.chunk_size))
     compile_seconds, calls = {}, {}
 
     def add(part, function, arguments):
         lowered: list[Any] = []
-        _, compile_seconds[part] = timed(lambda: lowered.append(function.lower(*arguments).compile()))
+        _, compile_seconds[part] = timed(lambda: lowered.append(function.lower(*arguments).compile(options)))
         calls[part] = lambda: jax.block_until_ready(lowered[0](*arguments))
         return calls[part]()
 

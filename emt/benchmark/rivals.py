@@ -175,7 +175,7 @@ def plain_form(bench: Bench) -> Rival | Missing:
 
 def variant_reports(bench: Bench, overrides: Sequence[str]) -> np.ndarray:
     """What emt reports in the first runs of a workload under other settings of its filter."""
-    experiment = load_experiment(bench.loaded.source.path, overrides).experiment
+    experiment = load_experiment(str(bench.loaded.source.path), overrides).experiment
     experiment = bench.loaded.experiment.model_copy(update={"filters": experiment.filters})
     program = Program.of(experiment)
     engine = Engine(program, experiment.monte_carlo.seed, bench.few, quick=True)

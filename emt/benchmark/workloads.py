@@ -88,11 +88,18 @@ def load_workload(name: str, overrides: Sequence[str] = ()) -> Loaded:
     return load_experiment(f"benchmark/{name}", overrides)
 
 
-def compiled_filter(program: Program, label: str, seed: jax.Array, runs: jax.Array, simulation) -> Callable[[], Any]:
+def options_of(engine: Engine) -> dict[str, Any] | None:
+    """What an engine tells the compiler: parts that are timed alone have to be compiled like the whole."""
+    return engine._options
+
+
+def compiled_filter(
+    program: Program, label: str, seed: jax.Array, runs: jax.Array, simulation, options: dict[str, Any] | None
+) -> Callable[[], Any]:
     """The call of the filter alone, without metrics, on these scans."""
     bare = dataclasses.replace(program, metrics=())
     arguments = (program.world, program.filter_params[label], seed, runs, simulation.scans, simulation.truth)
-    compiled = bare.scorer(label).lower(*arguments).compile()
+    compiled = bare.scorer(label).lower(*arguments).compile(options)
     return lambda: jax.block_until_ready(compiled(*arguments))
 
 
@@ -109,11 +116,11 @@ def prepared(name: str, overrides: Sequence[str] = ()) -> Bench:
     engine = Engine(program, seed, n)
     engine.compile()
     arguments = (program.world, jnp.asarray(seed), jnp.arange(n))
-    simulator = program.simulator().lower(*arguments).compile()
+    simulator = program.simulator().lower(*arguments).compile(options_of(engine))
     simulation = jax.block_until_ready(simulator(*arguments))
     calls = {
         "simulation": lambda: jax.block_until_ready(simulator(*arguments)),
-        "filter": compiled_filter(program, label, *arguments[1:], simulation),
+        "filter": compiled_filter(program, label, *arguments[1:], simulation, options_of(engine)),
         "end_to_end": lambda: engine.run_chunk(0, n),
     }
     arrays = engine.run_chunk(0, n, tracked=n)

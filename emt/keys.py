@@ -31,9 +31,14 @@ def purpose_key(key: PRNGKeyArray, purpose: Purpose) -> PRNGKeyArray:
     return jax.random.fold_in(key, int(purpose))
 
 
-def filter_key(key: PRNGKeyArray, label: str) -> PRNGKeyArray:
-    """Key of one filter within a run, by its label."""
-    return jax.random.fold_in(purpose_key(key, Purpose.FILTER), zlib.crc32(label.encode()))
+def filter_number(label: str) -> int:
+    """The number by which the keys of a filter differ from those of the others."""
+    return zlib.crc32(label.encode())
+
+
+def filter_key(key: PRNGKeyArray, number: int | Int[Array, ""]) -> PRNGKeyArray:
+    """Key of one filter within a run, by its number (see `filter_number`)."""
+    return jax.random.fold_in(purpose_key(key, Purpose.FILTER), number)
 
 
 def step_key(key: PRNGKeyArray, step: Int[Array, ""]) -> PRNGKeyArray:

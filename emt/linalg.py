@@ -274,6 +274,18 @@ class Chol3:
         )
 
 
+def once(values, known: Real):
+    """The same values, computed once.
+
+    XLA on CPUs computes cheap arithmetic anew in each place where its result enters, and does not heed optimisation
+    barriers; but it never merges what lies on both sides of a conditional.
+
+    Args:
+        known: any finite number that the compiler cannot know and that all runs share, such as a parameter.
+    """
+    return jax.lax.cond(jnp.all(known < jnp.inf), lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+
+
 def is_positive_definite(cov: Sym2) -> Real:
     """Whether the matrix is finite and positive definite."""
     finite = jnp.isfinite(cov.xx) & jnp.isfinite(cov.xy) & jnp.isfinite(cov.yy)
@@ -282,20 +294,21 @@ def is_positive_definite(cov: Sym2) -> Real:
 
 def all_finite(tree) -> Real:
     """Whether every number of a pytree is finite."""
-    leaves = [jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    return jnp.stack(leaves).all()
+    # zero times a number is zero, unless the number is not finite
+    leaves = [(0.0 * leaf).sum() for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return sum(leaves) == 0.0
 
 
 def cholesky(matrix):
-    """Lower Cholesky factor of a small positive definite matrix (n, n); NaN if it is not.
+    """Lower Cholesky factor of a small positive definite matrix (n, n), or of many (n, n, m); NaN if it is not.
 
     Column by column in plain operations, which batch and have derivatives without a triangular solver: that of XLA can
     wait for itself for ever on a CPU (seen with jaxlib 0.10 in batches of 600).
     """
     rest, columns = matrix, []
-    below = jnp.arange(matrix.shape[0])
+    below = jnp.arange(matrix.shape[0]).reshape(-1, *(1,) * (matrix.ndim - 2))
     for j in range(matrix.shape[0]):
-        column = jnp.where(below >= j, rest[:, j] / jnp.sqrt(rest[j, j]), 0.0)
+        column = jnp.where(below >= j, rest[:, j] / jnp.sqrt(rest[j, j])[None], 0.0)
         columns.append(column)
         rest = rest - column[:, None] * column[None, :]
     return jnp.stack(columns, axis=1)

@@ -4,7 +4,7 @@ On CPU, XLA calls the C library for every double; this is the same to the last b
 the compiler spreads over vector lanes: five times faster where angles are many (`emt bench zea2014/scenario_a`).
 """
 
-from math import factorial
+from math import factorial, pi
 
 import jax.numpy as jnp
 
@@ -20,6 +20,20 @@ def sincos(angle):
         return jnp.sin(angle), jnp.cos(angle)
     quarters = jnp.round(angle * (1.0 / (HIGH + MIDDLE)))
     rest = ((angle - quarters * HIGH) - quarters * MIDDLE) - quarters * LOW
+    return _from_quadrant(rest, quarters)
+
+
+def sincos_turns(turns):
+    """(sin, cos) of angles given in whole turns, which need no reduction."""
+    if turns.dtype != jnp.float64:
+        angle = 2.0 * pi * turns
+        return jnp.sin(angle), jnp.cos(angle)
+    quarters = jnp.round(4.0 * turns)
+    return _from_quadrant((turns - 0.25 * quarters) * (2.0 * pi), quarters)
+
+
+def _from_quadrant(rest, quarters):
+    """(sin, cos) of an angle of so many quarter turns and a rest within ±π/4."""
     square = rest * rest
     sine = rest * _series(square, 1)
     cosine = _series(square, 0)

@@ -30,6 +30,10 @@ class Measurements(NamedTuple):
     """True if the scan had more points than the capacity."""
     sources: Int[Array, "max_points"] | None = None
     """Component of a connected object that each point comes from, -1 for clutter; only simulation knows it."""
+    skipped: Bool[Array, ""] | None = None
+    """Whether screening took out a point; None before screening."""
+    statistics: Any = None
+    """`scans.ScanStatistics` of the real points, where they were computed beforehand."""
 
 
 class Ellipse(NamedTuple):

@@ -2,12 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emt.trigonometry import sincos
+from emt.trigonometry import sincos, sincos_turns
 
 
 @given(st.floats(-1e6, 1e6))
@@ -15,6 +16,14 @@ def test_to_the_last_bits(x):
     sine, cosine = sincos(jnp.asarray(x))
     assert float(sine) == pytest.approx(np.sin(x), abs=2.3e-16)
     assert float(cosine) == pytest.approx(np.cos(x), abs=2.3e-16)
+
+
+@given(st.floats(0.0, 1.0))
+def test_turns_to_the_last_bits(x):
+    sine, cosine = sincos_turns(jnp.asarray(x))
+    with mpmath.workdps(30):
+        assert float(sine) == pytest.approx(float(mpmath.sin(2 * mpmath.pi * x)), abs=3e-16)
+        assert float(cosine) == pytest.approx(float(mpmath.cos(2 * mpmath.pi * x)), abs=3e-16)
 
 
 def test_all_quadrants_and_their_edges():

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from emt.cli import bench, checking, describing, running, tuning
+from emt.cli import bench, checking, describing, reproducing, running, tuning
 from emt.cli.errors import run_app
 
 app = typer.Typer(
@@ -41,7 +41,7 @@ app.command("list")(describing.list_names)
 app.command("show")(describing.show)
 app.command("schema")(describing.schema)
 app.command("run")(running.run)
-app.command("reproduce")(running.reproduce)
+app.command("reproduce")(reproducing.reproduce)
 app.command("table")(running.table)
 app.command("replay")(running.replay)
 app.command("tune")(tuning.tune)

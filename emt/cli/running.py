@@ -1,4 +1,4 @@
-"""`emt run`, `emt reproduce`, `emt table`, `emt replay`."""
+"""`emt run`, `emt table`, `emt replay`."""
 
 from contextlib import contextmanager
 from enum import StrEnum
@@ -20,19 +20,9 @@ class TableFormat(StrEnum):
     json = "json"
 
 
-class Scale(StrEnum):
-    """How many runs."""
-
-    smoke = "smoke"
-    paper = "paper"
-
-
 Config = Annotated[str, typer.Argument(help="A file, or the name of a shipped experiment (see `emt list`).")]
 Overrides = Annotated[
     list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change, e.g. filters.vb.iterations=3.")
-]
-Data = Annotated[
-    list[Path] | None, typer.Option("--data", help="A recording, or a folder of recordings, found by its hash.")
 ]
 
 
@@ -129,72 +119,6 @@ def run_shown(
         kept = f"{last.done} of {last.total}" if last is not None else "all finished"
         message = f"interrupted: {kept} runs are kept in {folder}; the same command continues"
         raise InterruptedRunError(message) from None
-
-
-def reproduce(
-    papers: Annotated[list[str] | None, typer.Argument(metavar="[PAPER]...", help="Papers; all by default.")] = None,
-    scale: Annotated[Scale, typer.Option(help="Number of runs: the paper's table, or a quick look.")] = Scale.paper,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default results/reproduce-SCALE.")] = None,
-    data: Data = None,
-    tables: Annotated[Path | None, typer.Option(help="Also write reports with figures into this folder.")] = None,
-) -> None:
-    """Run every experiment of the papers and show published beside reproduced numbers.
-
-    Experiments on recordings are skipped, with a word, unless --data leads to their file.
-
-    Example: emt reproduce tuncer2021 --scale smoke
-    """
-    from emt.config.load import at_smoke_scale, load_experiment
-    from emt.config.shipped import config_names
-    from emt.config.shipped import papers as shipped_papers
-    from emt.registry import suggest
-    from emt.reports.paper import paper_report
-
-    wanted = papers or shipped_papers()
-    for paper in wanted:
-        if paper not in shipped_papers():
-            near = suggest(paper, shipped_papers())
-            hint = f" (did you mean '{near}'?)" if near else ""
-            raise UnusableError(f"unknown paper '{paper}'{hint}; known: {', '.join(shipped_papers())}")
-    out = Path("results") / f"reproduce-{scale}" if out is None else out
-    loaded = [load_experiment(name) for paper in wanted for name in config_names(paper)]
-    recordings = find_recordings(loaded, data or [])
-    for paper in wanted:
-        folders = {}
-        for item in (one for one in loaded if one.name.split("/")[0] == paper):
-            if item.experiment.scenario.kind == "recorded" and item.experiment.scenario.path is None:
-                if item.name not in recordings:
-                    say(f"{item.name}: skipped, it needs its recording: --data PATH")
-                    continue
-                item = load_experiment(item.name, [f"scenario.path={recordings[item.name]}"])
-            folders[item.name] = out / item.name
-            run_shown(at_smoke_scale(item) if scale == Scale.smoke else item, folders[item.name])
-        report = paper_report(paper, folders)
-        for part in report.tables:
-            typer.echo(part.render("text"))
-        path = report.write(out / paper)
-        say(f"report: {path}")
-        if tables is not None:
-            say(f"report: {report.write(tables, prefix=f'{paper}-', name=f'{paper}.md')}")
-
-
-def find_recordings(loaded, places: list[Path]) -> dict[str, Path]:
-    """The file of every recorded experiment that is found, by its hash, at or under the given places."""
-    import hashlib
-
-    wanted = {
-        item.experiment.scenario.sha256: item.name for item in loaded if item.experiment.scenario.kind == "recorded"
-    }
-    found = {}
-    for place in places:
-        if not place.exists():
-            raise UnusableError(f"--data {place}: there is no such file or folder")
-        for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
-            if path.is_file() and path.suffix.lower() in (".mat", ".csv"):
-                digest = hashlib.sha256(path.read_bytes()).hexdigest()
-                if digest in wanted:
-                    found[wanted[digest]] = path.resolve()
-    return found
 
 
 def table(

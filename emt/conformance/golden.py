@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from emt.filters.base import as_scan
 from emt.registry import suggest
+from emt.scans import as_scan
 from emt.types import Measurements
 
 MAX_BYTES = 64 << 20

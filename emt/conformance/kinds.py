@@ -24,10 +24,11 @@ from emt.conformance.shape_kinds import compare_ellipse_iou, compare_gaussian_wa
 from emt.filters import feldmann, gp_ett
 from emt.filters import mem_ekf_star as mem
 from emt.filters import vb_random_matrix as vb
-from emt.filters.base import TrackingModel, scan_statistics
+from emt.filters.base import TrackingModel
 from emt.filters.kinematics import Kinematics
 from emt.linalg import Chol3, Sym2, Vec2
 from emt.models.motion import FixedNoise, WhiteAcceleration
+from emt.scans import scan_statistics
 from emt.scenarios.recorded import RecordedSettings, read_scans
 from emt.types import Scalar
 

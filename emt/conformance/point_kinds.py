@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from emt.conformance.golden import Quantity, array
-from emt.filters.base import as_scan
 from emt.filters.gaussian import Belief, Kernel
 from emt.filters.kalman import kalman_kernel
 from emt.filters.multiple_model import Bank, multiple_model
@@ -18,6 +17,7 @@ from emt.filters.variable_structure import likely_model_set
 from emt.models.state_space.measurements import FunctionMeasurement, LinearMeasurement, Measurement
 from emt.models.state_space.model import StateSpaceModel
 from emt.models.state_space.motions import LinearMotion
+from emt.scans import as_scan
 from emt.types import Point, StatePrior
 
 INTERLEAVED = ("x", "vx", "y", "vy")

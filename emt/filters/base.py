@@ -1,4 +1,4 @@
-"""What filters share: the model they are told, the door that screens scans, and the guard of their states."""
+"""What filters share: the model they are told, their diagnostics, and the guard of their states."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -6,15 +6,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.tree_util import register_dataclass
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
 from emt.models.motion import MotionNoise
+from emt.scans import is_seen, scan_statistics, screen
 from emt.status import Status
-from emt.types import Articulated, Ellipse, Estimate, Filter, Info, Measurements, Point, Scalar, State, Traced
+from emt.types import Articulated, Ellipse, Estimate, Filter, Info, Measurements, Point, State, Traced
 
 GROSS_INNOVATION = 10.0
-"""An innovation of more than this many predicted standard deviations sets `Status.GROSS_INNOVATION`."""
+"""One point this many predicted standard deviations away sets `Status.GROSS_INNOVATION`, or several whose squared
+distances exceed what is expected by as much together."""
 
 
 @register_dataclass
@@ -29,27 +31,6 @@ class TrackingModel:
     extent_scale: Traced
     """Covariance of the points over the object in units of the squared semi-axes: 1/4 for a uniform ellipse, 1 for
     Gaussian points whose covariance is the extent."""
-
-
-@register_dataclass
-@dataclass(frozen=True)
-class ScanStatistics:
-    """Count, mean and scatter of the points of a scan: all that an order-free elliptical filter needs."""
-
-    count: Scalar
-    mean: Vec2
-    scatter: Sym2
-    """Sum of the outer products of the points about their mean (m²)."""
-
-
-def scan_statistics(scan: Measurements) -> ScanStatistics:
-    """Statistics of the real points of a scan; zeros for an empty one."""
-    x, y = jnp.where(scan.mask, scan.points[:, 0], 0.0), jnp.where(scan.mask, scan.points[:, 1], 0.0)
-    count = scan.mask.sum(dtype=scan.points.dtype)
-    share = 1.0 / jnp.maximum(count, 1.0)
-    mean = Vec2(share * x.sum(), share * y.sum())
-    dx, dy = jnp.where(scan.mask, x - mean.x, 0.0), jnp.where(scan.mask, y - mean.y, 0.0)
-    return ScanStatistics(count, mean, Sym2((dx * dx).sum(), (dx * dy).sum(), (dy * dy).sum()))
 
 
 def innovation_info(position: Vec2, position_cov: Sym2, spread: Sym2, scan: Measurements) -> Info:
@@ -75,10 +56,10 @@ def innovation_info(position: Vec2, position_cov: Sym2, spread: Sym2, scan: Meas
         - count * jnp.log(2.0 * jnp.pi)
         - jnp.log(count)
     )
+    # the sum over the points of their squared distances from the prediction; 2 is expected of each
     weight = (position_cov + spread).inverse()
-    dx, dy = scan.points[:, 0] - position.x, scan.points[:, 1] - position.y
-    distances = weight.xx * dx * dx + 2.0 * weight.xy * dx * dy + weight.yy * dy * dy
-    gross = (scan.mask & ~(distances <= GROSS_INNOVATION**2)).any()  # also where the distance is not a number
+    distances = weight.inner(stats.scatter) + stats.count * weight.quadratic(stats.mean - position)
+    gross = seen & ~(distances <= GROSS_INNOVATION**2 + 2.0 * count)  # also where the distance is not a number
     return Info(
         log_likelihood=jnp.where(seen, log_likelihood, 0.0),
         nis=jnp.where(seen, nis, 0.0),
@@ -86,19 +67,7 @@ def innovation_info(position: Vec2, position_cov: Sym2, spread: Sym2, scan: Meas
     )
 
 
-def screen(scan: Measurements) -> tuple[Measurements, Bool[Array, ""]]:
-    """Takes out points that are not finite, or so large that their fourth power is not; padding becomes zero.
-
-    Returns the clean scan and whether a point was taken out.
-    """
-    limit = float(jnp.finfo(scan.points.dtype).max) ** 0.25 / 16.0
-    sound = (jnp.abs(scan.points) < limit).all(axis=1)  # False for NaN
-    mask = scan.mask & sound
-    points = jnp.where(mask[:, None], scan.points, 0.0)
-    return scan._replace(points=points, mask=mask), (scan.mask & ~sound).any()
-
-
-def keep_if(condition: Bool[Array, ""], new, old):
+def keep_if(condition: Bool[Array, "*lanes"], new, old):
     """`new` where the condition holds, else `old`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
@@ -143,13 +112,13 @@ def guarded(flt: Filter) -> Filter:
         return Guarded(flt.predict(guard.state, dt, key), guard.last)
 
     def update(guard, scan, key):
-        scan, skipped = screen(scan)
+        scan = screen(scan)
         new, info = flt.update(guard.state, scan, key)
-        new = keep_if(scan.mask.any(), new, guard.state)
+        new = keep_if(is_seen(scan), new, guard.state)
         status = jnp.where(all_finite(new), estimate_status(flt.estimate(new)), int(Status.NON_FINITE))
         state = keep_if(status == 0, new, guard.last)
         status = status | info.status
-        status = status | jnp.where(skipped, int(Status.MEASUREMENT_SKIPPED), 0)
+        status = status | jnp.where(jnp.asarray(scan.skipped), int(Status.MEASUREMENT_SKIPPED), 0)
         status = status | jnp.where(scan.overflow, int(Status.SCAN_OVERFLOW), 0)
         finite = jnp.isfinite(info.log_likelihood) & jnp.isfinite(info.nis)
         status = status | jnp.where(finite, 0, int(Status.FLOOR_USED))
@@ -160,13 +129,3 @@ def guarded(flt: Filter) -> Filter:
         )
 
     return Filter(init, predict, update, lambda guard: flt.estimate(guard.state))
-
-
-def as_scan(points: Float[Array, "n 2"], capacity: int | None = None) -> Measurements:
-    """A scan holding these points, padded to `capacity` (default: no padding, but at least one slot)."""
-    n = points.shape[0]
-    capacity = max(n, 1) if capacity is None else capacity
-    if n > capacity:
-        raise ValueError(f"{n} points do not fit a scan of capacity {capacity}")
-    padded = jnp.zeros((capacity, 2), points.dtype).at[:n].set(points)
-    return Measurements(padded, jnp.arange(capacity) < n, jnp.asarray(False))

@@ -25,10 +25,11 @@ class ConnectedModel:
 
 def moved(mean: Float[Array, "n"], cov: Float[Array, "n n"], dt: Scalar, model: ConnectedModel):
     """Mean and covariance a step later: every angle by its rate, α ← α + dt ω, everything else as it is."""
-    turn = jnp.zeros((len(mean), len(mean)), mean.dtype)
-    for angle in model.plan.angles:
-        turn = turn.at[angle, angle + 1].set(1.0)
-    shift = dt * turn
-    half = cov + (shift[:, :, None] * cov[None, :, :]).sum(axis=1)
-    full = half + (half[:, None, :] * shift[None, :, :]).sum(axis=2)
-    return mean + (shift * mean[None, :]).sum(axis=1), full + jnp.diag(model.process_variance)
+    turning = model.plan.angles
+
+    def along(array):
+        """The first axis a step later; the rate of an angle is the entry after it."""
+        return jnp.stack([row + dt * array[i + 1] if i in turning else row for i, row in enumerate(array)])
+
+    full = along(along(cov).T).T
+    return along(mean), full + jnp.diag(model.process_variance)

@@ -8,10 +8,11 @@ from jax.tree_util import register_dataclass
 from pydantic import Field
 
 from emt.filters import kinematics
-from emt.filters.base import ScanStatistics, TrackingModel, innovation_info, scan_statistics
+from emt.filters.base import TrackingModel, innovation_info
 from emt.filters.kinematics import Kinematics
 from emt.linalg import Sym2, parallel
 from emt.registry import FILTERS
+from emt.scans import ScanStatistics, scan_statistics
 from emt.settings import Duration, PositiveFloat, Settings, UnitInterval
 from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
 

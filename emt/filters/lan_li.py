@@ -8,9 +8,10 @@ from jax.scipy.special import gammaln
 from jax.tree_util import register_dataclass
 from pydantic import Field
 
-from emt.filters.base import ScanStatistics, TrackingModel, innovation_info, scan_statistics
+from emt.filters.base import TrackingModel, innovation_info
 from emt.linalg import Mat2, Sym2, Vec2
 from emt.registry import FILTERS
+from emt.scans import ScanStatistics, scan_statistics
 from emt.settings import AccelerationDensity, Angle, PositiveFloat, Settings
 from emt.shapes.ellipse import extent_matrix
 from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, Traced

@@ -6,15 +6,17 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.tree_util import register_dataclass
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from emt.filters import kinematics
 from emt.filters.base import TrackingModel, innovation_info, keep_if
 from emt.filters.kinematics import Kinematics
-from emt.linalg import Chol3, Mat2, Sym2, Vec2, parallel
+from emt.linalg import Chol3, Mat2, Sym2, Vec2, once
 from emt.registry import FILTERS
+from emt.scans import filled_slots
 from emt.settings import Covariance3, Settings, ShapeNoise
 from emt.status import Status
+from emt.trigonometry import sincos
 from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar
 
 PIVOT_FLOOR = 1e-12
@@ -55,15 +57,28 @@ class MemState(NamedTuple):
     """Factor of the covariance of (orientation, semi-axis 1, semi-axis 2)."""
 
 
-def extent_spread(state: MemState, scale: Scalar) -> Sym2:
+def extent_spread(semi_axes: Vec2, shape_chol: Chol3, scale: Scalar) -> Sym2:
     """Predicted covariance of a point about the centre, in the frame of the axes: C_I + C_II of the paper (m²)."""
-    l1, l2 = state.semi_axes.x, state.semi_axes.y
-    tt, t1, c11, t2, _, c22 = state.shape_chol.triangle()
+    l1, l2 = semi_axes.x, semi_axes.y
+    tt, t1, c11, t2, _, c22 = shape_chol.triangle()
     return scale * Sym2(l1 * l1 + c11 + l2 * l2 * tt, l1 * t1 - l2 * t2, l2 * l2 + c22 + l1 * l1 * tt)
 
 
-def update_with_point(state: MemState, point: Vec2, model: TrackingModel) -> MemState:
-    """Update with one point.
+class Now(NamedTuple):
+    """What changes from point to point. Gain and conditional covariance of the velocity stay as they are, so the
+    velocity can wait for the last point; the rotation is carried, or it would be computed anew wherever it enters."""
+
+    position: Vec2
+    position_cov: Sym2
+    orientation: Scalar
+    semi_axes: Vec2
+    shape_chol: Chol3
+    axes: Mat2
+    """Rotation by the orientation."""
+
+
+def update_with_point(state: Now, point: Vec2, real: Bool[Array, ""], model: TrackingModel) -> Now:
+    """Update with one point, or none where it is not real: with a weight of zero nothing moves.
 
     The pseudo-measurement (e1 e2, e1², e2²) is taken in the frame of the predicted axes. The gain does not depend on
     this linear change of coordinates, but there its measurement matrix is diagonal, M = k diag(l1² - l2², 2 l1, 2 l2)
@@ -72,18 +87,19 @@ def update_with_point(state: MemState, point: Vec2, model: TrackingModel) -> Mem
 
     Source: Yang and Baum 2019, eqs. 15-24, with the shape covariance carried as a Cholesky factor.
     """
-    k, belief = model.extent_scale, state.kinematics
+    k, axes, centre_cov = model.extent_scale, state.axes, state.position_cov
     l1, l2 = state.semi_axes.x, state.semi_axes.y
-    axes = Mat2.rotation(state.orientation)
-    centre_cov = belief.position_cov
-    noise = axes.congruence(extent_spread(state, k)) + model.sensor_noise
-    innovation = point - belief.position
-    weight = (centre_cov + noise).inverse()
-    position = belief.position + centre_cov @ (weight @ innovation)
-    position_cov = parallel(centre_cov, noise)
+    noise = axes.congruence(extent_spread(state.semi_axes, state.shape_chol, k)) + model.sensor_noise
+    noise, inverse_det = once((noise, 1.0 / (centre_cov + noise).det()), k)
+    innovation = point - state.position
+    weight = jnp.where(real, inverse_det, 0.0) * (centre_cov + noise).adjugate()
+    # (C⁻¹ + Y⁻¹)⁻¹ = (|Y| C + |C| Y) / |C + Y|
+    position_cov = keep_if(real, inverse_det * (noise.det() * centre_cov + centre_cov.det() * noise), centre_cov)
 
     w = axes.T.congruence(weight)
     f = w @ (axes.T @ innovation)
+    w, f = once((w, f), k)
+    position = state.position + centre_cov @ (axes @ f)
     mt, m1, m2 = k * (l1 * l1 - l2 * l2), 2.0 * k * l1, 2.0 * k * l2
     # M C_Y⁻¹ (Y - Ȳ)
     pull_t = mt * (f.x * f.y - w.xy)
@@ -93,6 +109,7 @@ def update_with_point(state: MemState, point: Vec2, model: TrackingModel) -> Mem
     t1, t2 = mt * m1 * w.xx * w.xy, mt * m2 * w.xy * w.yy
     i11, i12, i22 = 0.5 * m1 * m1 * w.xx**2, 0.5 * m1 * m2 * w.xy**2, 0.5 * m2 * m2 * w.yy**2
 
+    pull_t, pull_1, pull_2, tt, t1, t2, i11, i12, i22 = once((pull_t, pull_1, pull_2, tt, t1, t2, i11, i12, i22), k)
     u = state.shape_chol
     # shift = U Uᵀ pull
     h1 = u.a11 * pull_t + u.a21 * pull_1 + u.a31 * pull_2
@@ -114,22 +131,35 @@ def update_with_point(state: MemState, point: Vec2, model: TrackingModel) -> Mem
         1.0 - u.a33 * p3[2],
         floor=PIVOT_FLOOR,
     )
-    return MemState(
-        kinematics.with_position(belief, position, position_cov),
-        state.orientation + u.a11 * h1,
-        Vec2(l1 + u.a21 * h1 + u.a22 * h2, l2 + u.a31 * h1 + u.a32 * h2 + u.a33 * h3),
-        u @ kept,
-    )
+    orientation = state.orientation + u.a11 * h1
+    semi_axes = Vec2(l1 + u.a21 * h1 + u.a22 * h2, l2 + u.a31 * h1 + u.a32 * h2 + u.a33 * h3)
+    return Now(position, position_cov, orientation, semi_axes, u @ once(kept, k), rotation(orientation))
+
+
+def rotation(angle: Scalar) -> Mat2:
+    """Anticlockwise rotation by `angle` (rad)."""
+    sine, cosine = sincos(angle)
+    return Mat2(cosine, -sine, sine, cosine)
 
 
 def update(state: MemState, scan: Measurements, model: TrackingModel) -> MemState:
     """Update with every point of the scan in turn; the order matters, as in the paper."""
+    belief = state.kinematics
 
-    def step(state, point_and_mask):
-        point, real = point_and_mask
-        return keep_if(real, update_with_point(state, Vec2.of(point), model), state), None
+    def step(j, now: Now) -> Now:
+        return update_with_point(now, Vec2.of(scan.points[j]), scan.mask[j], model)
 
-    return jax.lax.scan(step, state, (scan.points, scan.mask))[0]
+    start = Now(
+        belief.position,
+        belief.position_cov,
+        state.orientation,
+        state.semi_axes,
+        state.shape_chol,
+        rotation(state.orientation),
+    )
+    new = jax.lax.fori_loop(0, filled_slots(scan), step, start)
+    moved = kinematics.with_position(belief, new.position, new.position_cov)
+    return MemState(moved, new.orientation, new.semi_axes, new.shape_chol)
 
 
 def predict(state: MemState, dt: Scalar, model: TrackingModel, params: Params) -> MemState:
@@ -159,8 +189,8 @@ def mem_ekf_star(params: Params, model: TrackingModel) -> Filter:
         return MemState(belief, prior.ellipse.orientation, axes, Chol3.of(params.shape_cov))
 
     def update_step(state: MemState, scan: Measurements, key):
-        axes = Mat2.rotation(state.orientation)
-        spread = axes.congruence(extent_spread(state, model.extent_scale)) + model.sensor_noise
+        axes, spread = rotation(state.orientation), extent_spread(state.semi_axes, state.shape_chol, model.extent_scale)
+        spread = axes.congruence(spread) + model.sensor_noise
         info = innovation_info(state.kinematics.position, state.kinematics.position_cov, spread, scan)
         new = update(state, scan, model)
         size = jnp.max(jnp.abs(jnp.stack([new.semi_axes.array(), state.semi_axes.array()])))

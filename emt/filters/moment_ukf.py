@@ -1,19 +1,23 @@
-"""Unscented Kalman filter on image moments, with constant-velocity or coordinated-turn motion."""
+"""Unscented Kalman filter on image moments, with constant-velocity or coordinated-turn motion.
+
+Arrays may have further axes behind those shown; everything is computed along them (see `emt.lanes`).
+"""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 from jax.tree_util import register_dataclass
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from pydantic import Field, model_validator
 
 from emt.filters.base import TrackingModel, innovation_info, keep_if
 from emt.filters.moment_update import Projection, augmented_update, expected, moments_in, point_update, projected
 from emt.filters.unscented import Gaussian, Spread, merge_gaussians, product, square_root
+from emt.lanes import PerRun, lanes_last, total
 from emt.linalg import Sym2, Vec2
-from emt.models.motion import WhiteAcceleration
 from emt.models.turn import coordinated_turn
 from emt.registry import FILTERS
 from emt.settings import (
@@ -28,7 +32,7 @@ from emt.settings import (
 )
 from emt.shapes.moments import ellipse_of, moments_of
 from emt.status import Status
-from emt.types import Estimate, Filter, Measurements, Prior, Scalar, Traced
+from emt.types import Estimate, Filter, Measurements, Prior, Traced
 
 KINEMATIC = jnp.array([3, 5, 4, 6])
 """Rows of x, y, vx, vy in the state (n11, n20, n02, x, vx, y, vy[, turn rate])."""
@@ -96,8 +100,8 @@ class MomentUkfSettings(Settings):
 class Params:
     """Traced numbers of the filter."""
 
-    moment_cov: Float[Array, "3 3"]
-    moment_noise: Float[Array, "3 3"]
+    moment_cov: Float[Array, "3 3 *lanes"]
+    moment_noise: Float[Array, "3 3 *lanes"]
     acceleration: Traced
     """Power spectral density or variance, by the motion."""
     turn_acceleration: Traced
@@ -105,18 +109,21 @@ class Params:
     projection: Projection | None
 
 
-def blocks(moments, position_velocity, turn_rate=None) -> Float[Array, "n n"]:
+def blocks(moments, position_velocity, turn_rate=None) -> Float[Array, "n n *lanes"]:
     """Block-diagonal covariance of the state: moments (3, 3), one axis (2, 2) for both axes, turn rate."""
     n = 7 if turn_rate is None else 8
-    cov = jnp.zeros((n, n), moments.dtype).at[:3, :3].set(moments)
-    cov = cov.at[3:5, 3:5].set(position_velocity).at[5:7, 5:7].set(position_velocity)
+    cov = jnp.zeros((n, n, *moments.shape[2:]), moments.dtype).at[:3, :3].set(moments)
+    axis = position_velocity.reshape(2, 2, *(1,) * (cov.ndim - position_velocity.ndim), *position_velocity.shape[2:])
+    cov = cov.at[3:5, 3:5].set(axis).at[5:7, 5:7].set(axis)
     return cov if turn_rate is None else cov.at[7, 7].set(turn_rate)
 
 
-def predict_linear(belief: Gaussian, dt: Scalar, params: Params) -> Gaussian:
+def predict_linear(belief: Gaussian, dt: PerRun, params: Params) -> Gaussian:
     """Constant velocity and moments (Yao et al. 2020, eqs. 13, 14, 26, 27)."""
-    noise = WhiteAcceleration(params.acceleration)(dt).array()
-    axis = jnp.stack([jnp.stack([noise[0, 0], noise[0, 2]]), jnp.stack([noise[2, 0], noise[2, 2]])])
+    square = params.acceleration * dt * dt
+    axis = jnp.stack(
+        [jnp.stack([square * dt / 3.0, square / 2.0]), jnp.stack([square / 2.0, params.acceleration * dt])]
+    )
 
     def move(state):
         return state.at[3].add(dt * state[4]).at[5].add(dt * state[6])
@@ -125,7 +132,7 @@ def predict_linear(belief: Gaussian, dt: Scalar, params: Params) -> Gaussian:
     return Gaussian(move(belief.mean), square_root(cov))
 
 
-def turn(state, dt: Scalar):
+def turn(state, dt: PerRun):
     """Coordinated turn of one state (8,) or of many (8, m): moments, position and velocity (eqs. 15-20)."""
     position, velocity = coordinated_turn(Vec2(state[3], state[5]), Vec2(state[4], state[6]), state[7], dt)
     mean, half = 0.5 * (state[1] + state[2]), 0.5 * (state[1] - state[2])
@@ -135,14 +142,14 @@ def turn(state, dt: Scalar):
     return jnp.stack(rows)
 
 
-def predict_turn(belief: Gaussian, dt: Scalar, params: Params) -> Gaussian:
+def predict_turn(belief: Gaussian, dt: PerRun, params: Params) -> Gaussian:
     """Unscented prediction of a coordinated turn; the six additive noises collapse to their covariance."""
     c = params.spread.squared_step(8 + 6)
     step = jnp.sqrt(c) * belief.root
     center = turn(belief.mean, dt)
     plus = turn(belief.mean[:, None] + step, dt) - center[:, None]
     minus = turn(belief.mean[:, None] - step, dt) - center[:, None]
-    bend = (plus + minus).sum(axis=1) / (2.0 * c)
+    bend = total(jnp.moveaxis(plus + minus, 1, 0)) / (2.0 * c)
     half, full = 0.5 * dt * dt, dt
     axis = params.acceleration * jnp.stack(
         [jnp.stack([half * half, half * full]), jnp.stack([half * full, full * full])]
@@ -156,39 +163,44 @@ def predict_turn(belief: Gaussian, dt: Scalar, params: Params) -> Gaussian:
 
 
 def update(
-    belief: Gaussian, scan: Measurements, model: TrackingModel, params: Params, augmented: bool
-) -> tuple[Gaussian, Bool[Array, ""]]:
+    belief: Gaussian, points, mask, noise: Sym2, params: Params, one=point_update
+) -> tuple[Gaussian, Bool[Array, "*lanes"]]:
     """Sequential update by the points of a scan in their order, and whether a mean had to be projected."""
-    one = augmented_update if augmented else point_update
 
     def body(j, carry):
         now, before = carry
-        point = Vec2(scan.points[j, 0], scan.points[j, 1])
-        new, acted = projected(one(now, point, model.sensor_noise, params.spread, params.projection), params.projection)
-        return keep_if(scan.mask[j], (new, before | acted), carry)
+        new = one(now, Vec2(points[j, 0], points[j, 1]), noise, params.spread, params.projection)
+        new, acted = projected(new, params.projection)
+        return keep_if(mask[j], (new, before | acted), carry)
 
-    slots = jnp.arange(scan.mask.shape[0])
-    last = jnp.where(scan.mask, slots + 1, 0).max()  # padding at the end costs nothing
-    return jax.lax.fori_loop(0, last, body, (belief, jnp.asarray(False)))
+    return jax.lax.fori_loop(0, last_of(mask), body, (belief, jnp.zeros(mask.shape[1:], bool)))
 
 
-def log_likelihood(belief: Gaussian, scan: Measurements, model: TrackingModel, params: Params) -> Scalar:
+def last_of(mask: Bool[Array, "max_points *lanes"]) -> Int[Array, ""]:
+    """Slots up to the last real point, of the fullest scan if there are several: padding at the end costs nothing."""
+    filled = mask.reshape(mask.shape[0], -1).any(axis=1)
+    return jnp.where(filled, jnp.arange(mask.shape[0]) + 1, 0).max()
+
+
+def log_likelihood(belief: Gaussian, points, mask, noise: Sym2, params: Params) -> PerRun:
     """Sum over the points of log N(0; mean, variance) of their pseudo-measurements, all under the prediction
     (Yao et al. 2020, Algorithm 2, which takes the average)."""
 
-    def one(point):
-        now = expected(belief, Vec2(point[0], point[1]), model.sensor_noise, params.spread, params.projection)
-        return -0.5 * (now.mean * now.mean / now.variance + jnp.log(2.0 * jnp.pi * now.variance))
+    def body(j, before):
+        now = expected(belief, Vec2(points[j, 0], points[j, 1]), noise, params.spread, params.projection)
+        one = -0.5 * (now.mean * now.mean / now.variance + jnp.log(2.0 * jnp.pi * now.variance))
+        return before + jnp.where(mask[j], one, 0.0)
 
-    return jnp.where(scan.mask, jax.vmap(one)(scan.points), 0.0).sum()
+    return jax.lax.fori_loop(0, last_of(mask), body, jnp.zeros(mask.shape[1:], points.dtype))
 
 
-def resized(belief: Gaussian, n: int) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+def resized(belief: Gaussian, n: int) -> tuple[Float[Array, "n *lanes"], Float[Array, "n n *lanes"]]:
     """Mean and covariance with the turn rate dropped, or appended as a zero that is known exactly."""
     have, cov = belief.mean.shape[0], belief.cov()
     if have >= n:
         return belief.mean[:n], cov[:n, :n]
-    return jnp.pad(belief.mean, (0, n - have)), jnp.pad(cov, (0, n - have))
+    more, none = (0, n - have), [(0, 0)] * (cov.ndim - 2)
+    return jnp.pad(belief.mean, [more, *none]), jnp.pad(cov, [more, more, *none])
 
 
 def moment_ukf(turning: bool, augmented: bool, params: Params, model: TrackingModel) -> Filter:
@@ -208,29 +220,37 @@ def moment_ukf(turning: bool, augmented: bool, params: Params, model: TrackingMo
             mean, cov = mean.at[7].set(prior.turn_rate), cov.at[7, 7].set(prior.turn_rate_var)
         return Gaussian(mean, square_root(cov))
 
+    @lanes_last
+    def mapped_estimate(belief: Gaussian) -> Estimate:
+        kinematic = belief.root[KINEMATIC]
+        ellipse = ellipse_of(Sym2(belief.mean[1], belief.mean[0], belief.mean[2]))
+        return Estimate(belief.mean[KINEMATIC], product(kinematic), ellipse)
+
+    @lanes_last
+    def mapped_merge(weights, beliefs) -> Gaussian:
+        means, covs = zip(*(resized(belief, n) for belief in beliefs), strict=True)
+        mean, cov = merge_gaussians(weights, jnp.stack(means), jnp.stack(covs))
+        return Gaussian(mean, square_root(cov))
+
+    mapped_predict = lanes_last(predict_turn if turning else predict_linear)
+    mapped_likelihood = lanes_last(log_likelihood)
+    mapped_update = partial(update, one=augmented_update) if augmented else lanes_last(update)
+
     def predict_step(belief, dt, key):
-        return predict_turn(belief, dt, params) if turning else predict_linear(belief, dt, params)
+        return mapped_predict(belief, dt, params)
 
     def update_step(belief: Gaussian, scan: Measurements, key):
         position = Vec2(belief.mean[3], belief.mean[5])
         cov = product(jnp.stack([belief.root[3], belief.root[5]]))
         spread = moments_in(belief.mean, params.projection) + model.sensor_noise
         info = innovation_info(position, Sym2.of(cov), spread, scan)
-        likelihood = log_likelihood(belief, scan, model, params)
-        new, acted = update(belief, scan, model, params, augmented)
+        told = scan.points, scan.mask, model.sensor_noise, params
+        likelihood = mapped_likelihood(belief, *told)
+        new, acted = mapped_update(belief, *told)
         status = info.status | jnp.where(acted, int(Status.MOMENTS_PROJECTED), 0)
         return new, info._replace(log_likelihood=likelihood, status=status)
 
-    def estimate(belief: Gaussian) -> Estimate:
-        cov = product(belief.root[KINEMATIC])
-        return Estimate(belief.mean[KINEMATIC], cov, ellipse_of(Sym2(belief.mean[1], belief.mean[0], belief.mean[2])))
-
-    def merge(weights, beliefs) -> Gaussian:
-        means, covs = zip(*(resized(belief, n) for belief in beliefs), strict=True)
-        mean, cov = merge_gaussians(weights, jnp.stack(means), jnp.stack(covs))
-        return Gaussian(mean, square_root(cov))
-
-    return Filter(init, predict_step, update_step, estimate, merge)
+    return Filter(init, predict_step, update_step, mapped_estimate, mapped_merge)
 
 
 def build(settings: MomentUkfSettings):

@@ -1,5 +1,7 @@
 """Measurement update of image moments by one point: the collapsed unscented transform and its augmented original.
 
+Arrays may have further axes behind those shown; everything is computed along them (see `emt.lanes`).
+
 A point z on the object satisfies 0 = q(z, p) - s² - f: q is the squared scale of the ellipse through z, s² is uniform
 on (0, 1) for points uniform on the ellipse, and f is what the sensor noise adds to q, as a Gaussian with the moments it
 has at the current mean.
@@ -15,9 +17,10 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Float
 
 from emt.filters.unscented import Gaussian, Spread, product, scalar_update, square_root
-from emt.linalg import Sym2, Vec2
+from emt.lanes import PerRun, total
+from emt.linalg import Sym2, Vec2, once
 from emt.shapes.moments import project
-from emt.types import Scalar, Traced
+from emt.types import Traced
 
 X, Y = 3, 5
 """Rows of the position; rows 0 to 2 are n11, n20, n02, rows 4 and 6 the velocity."""
@@ -37,10 +40,10 @@ class Projection:
 class Expected(NamedTuple):
     """The pseudo-measurement of one point as the belief expects it."""
 
-    mean: Scalar
-    variance: Scalar
-    cross: Float[Array, "n"]
-    """u: the cross-covariance with the state is root @ u."""
+    mean: PerRun
+    variance: PerRun
+    cross: Float[Array, "m *lanes"]
+    """u: the cross-covariance with the state is root[:, :m] @ u."""
 
 
 def moments_in(state, projection: Projection | None) -> Sym2:
@@ -52,10 +55,16 @@ def moments_in(state, projection: Projection | None) -> Sym2:
 def squared_scale(state, point: Vec2, projection: Projection | None):
     """q(z, p) = ¼ dᵀ N⁻¹ d: 1 on the ellipse, 0 at its centre; for one state (n,) or many (n, m)."""
     moments = moments_in(state, projection)
-    return 0.25 * moments.inverse().quadratic(Vec2(point.x - state[X], point.y - state[Y]))
+    dx, dy = _behind(point.x, state[X]) - state[X], _behind(point.y, state[Y]) - state[Y]
+    return 0.25 * moments.inverse().quadratic(Vec2(dx, dy))
 
 
-def noise_moments(mean: Float[Array, "n"], point: Vec2, noise: Sym2, projection: Projection | None):
+def _behind(number, like):
+    """A number of each run, for states that come several to a run."""
+    return number if jnp.ndim(number) == jnp.ndim(like) else number[None]
+
+
+def noise_moments(mean: Float[Array, "n *lanes"], point: Vec2, noise: Sym2, projection: Projection | None):
     """Mean and variance of f at a mean state.
 
     With M = N⁻¹/4 and f = 2 dᵀ M v + vᵀ M v up to sign: E f = tr(M R), Var f = 2 tr(M R M R) + 4 dᵀ M R M d. It is the
@@ -72,25 +81,28 @@ def expected(belief: Gaussian, point: Vec2, noise: Sym2, spread: Spread, project
     """The pseudo-measurement under a belief.
 
     s² and f are additive, so the transform over (p, s², f), of dimension n + 2, is exactly one over p with its step.
+    The root is a lower triangular one, or what updates make of it: its columns after that of y move velocity and turn
+    rate only, and the measurement not at all.
     """
     c = spread.squared_step(belief.mean.shape[0] + 2)
-    step = jnp.sqrt(c) * belief.root
+    step = jnp.sqrt(c) * belief.root[:, : Y + 1]
     center = squared_scale(belief.mean, point, projection)
-    plus = squared_scale(belief.mean[:, None] + step, point, projection) - center
-    minus = squared_scale(belief.mean[:, None] - step, point, projection) - center
-    bend = (plus + minus).sum() / (2.0 * c)
+    plus = squared_scale(belief.mean[:, None] + step, point, projection) - center[None]
+    minus = squared_scale(belief.mean[:, None] - step, point, projection) - center[None]
+    plus, minus = once((plus, minus), spread.gamma)
+    bend = total(plus + minus) / (2.0 * c)
     cross = (plus - minus) / (2.0 * jnp.sqrt(c))
     noise_mean, noise_variance = noise_moments(belief.mean, point, noise, projection)
-    variance = ((plus * plus + minus * minus).sum()) / (2.0 * c) + bend * bend * (spread.beta - spread.gamma**2)
+    variance = total(plus * plus + minus * minus) / (2.0 * c) + bend * bend * (spread.beta - spread.gamma**2)
     # only beta < gamma² can take it below the part that is explained
-    variance = jnp.maximum(variance, (cross * cross).sum()) + noise_variance + SCALE_VARIANCE
+    variance = jnp.maximum(variance, total(cross * cross)) + noise_variance + SCALE_VARIANCE
     return Expected(center + bend - noise_mean - SCALE_MEAN, variance, cross)
 
 
 def point_update(belief: Gaussian, point: Vec2, noise: Sym2, spread: Spread, projection: Projection | None) -> Gaussian:
     """Update by one point in closed form; the new mean is not projected."""
     now = expected(belief, point, noise, spread, projection)
-    return scalar_update(belief, now.cross, -now.mean, now.variance)
+    return scalar_update(belief, now.cross, -now.mean, now.variance, spread.gamma)
 
 
 def augmented_update(
@@ -118,8 +130,8 @@ def augmented_update(
     return Gaussian(belief.mean - gain * predicted, square_root(cov, jitter=0.0))
 
 
-def projected(belief: Gaussian, projection: Projection | None) -> tuple[Gaussian, Bool[Array, ""]]:
+def projected(belief: Gaussian, projection: Projection | None) -> tuple[Gaussian, Bool[Array, "*lanes"]]:
     """The belief with its mean moments projected, and whether that changed them."""
     moments = moments_in(belief.mean, projection)
     new = jnp.stack([moments.xy, moments.xx, moments.yy])
-    return belief._replace(mean=belief.mean.at[:3].set(new)), (new != belief.mean[:3]).any()
+    return belief._replace(mean=belief.mean.at[:3].set(new)), (new != belief.mean[:3]).any(axis=0)

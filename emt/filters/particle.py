@@ -11,6 +11,7 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 from pydantic import Field, PositiveInt
 
+from emt.draws import normals
 from emt.filters.gaussian import Belief, Innovation, Kernel, Prediction, conditioned, symmetric
 from emt.filters.kalman import kalman_kernel
 from emt.filters.mixing import posterior
@@ -151,7 +152,7 @@ def particle(
 
     def init(prior, key) -> ParticleState:
         n, dtype = len(prior.mean), prior.mean.dtype
-        draws = jax.random.normal(key, (count, n), dtype) @ semidefinite_root(prior.cov).T
+        draws = normals(key, (count, n), dtype) @ semidefinite_root(prior.cov).T
         particles, time = prior.mean[None, :] + draws, jnp.asarray(model.start_time, dtype)
         weights, floor = jnp.full(count, 1.0 / count, dtype), FLOOR * jnp.diagonal(prior.cov)
         if kernel is None:
@@ -207,7 +208,7 @@ def particle(
         """Particles drawn given the measurement, their covariances, and the gains of their log weights."""
         beliefs, _ = jax.vmap(lambda now: kernel.update(now, value, state.time))(own.predictions)
         roots = jax.vmap(cholesky)(beliefs.cov)
-        draw = jax.random.normal(key, state.particles.shape, state.particles.dtype)
+        draw = normals(key, state.particles.shape, state.particles.dtype)
         particles = beliefs.mean + (roots * draw[:, None, :]).sum(axis=2)
         scale = jnp.log(jnp.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
         log_proposal = -0.5 * (draw * draw + jnp.log(2.0 * jnp.pi)).sum(axis=1) - scale

@@ -11,9 +11,10 @@ from pydantic import Field
 
 from emt.filters import kinematics
 from emt.filters import vb_random_matrix as vb
-from emt.filters.base import ScanStatistics, TrackingModel, innovation_info, scan_statistics
+from emt.filters.base import TrackingModel, innovation_info
 from emt.linalg import Sym2, Vec2, parallel
 from emt.registry import FILTERS
+from emt.scans import ScanStatistics, scan_statistics
 from emt.settings import PositiveAngleVariance, Settings, ShapeParameter
 from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
 

@@ -159,7 +159,7 @@ def over_points(one_point, belief: Belief, scan: Measurements) -> tuple[Belief, 
         info = jax.tree.map(lambda x: jnp.where(slot.mask, x, jnp.zeros_like(x)), info)
         return keep_if(slot.mask, new, belief), info
 
-    slots = scan._replace(overflow=jnp.broadcast_to(scan.overflow, scan.mask.shape))
+    slots = Measurements(scan.points, scan.mask, jnp.broadcast_to(scan.overflow, scan.mask.shape), scan.sources)
     if scan.mask.shape[0] == 1:
         return step(belief, jax.tree.map(lambda leaf: leaf[0], slots))
     belief, infos = jax.lax.scan(step, belief, slots)

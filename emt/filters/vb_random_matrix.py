@@ -9,12 +9,14 @@ from jax.tree_util import register_dataclass
 from pydantic import PositiveInt
 
 from emt.filters import kinematics
-from emt.filters.base import ScanStatistics, TrackingModel, innovation_info, scan_statistics
+from emt.filters.base import TrackingModel, innovation_info
 from emt.filters.kinematics import Kinematics
-from emt.linalg import Sym2, Vec2, fuse, rotated_diagonal
+from emt.linalg import Sym2, Vec2, fuse, once, rotated_diagonal
 from emt.registry import FILTERS
+from emt.scans import ScanStatistics, scan_statistics
 from emt.settings import AngleVariance, PositiveAngleVariance, Settings, ShapeParameter, UnitInterval
 from emt.status import Status
+from emt.trigonometry import sincos
 from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
 
 MIN_SHAPE = 1.25
@@ -62,6 +64,20 @@ class VbState(NamedTuple):
     """Inverse-gamma scales (m²)."""
 
 
+class Turn(NamedTuple):
+    """Expectations over the orientation: E cos 2θ = shrink cos2, E sin 2θ = shrink sin2."""
+
+    cos2: Scalar
+    sin2: Scalar
+    shrink: Scalar
+
+    @staticmethod
+    def of(orientation: Scalar, variance: Scalar) -> "Turn":
+        """Of an orientation with this mean and variance (rad, rad²)."""
+        sin2, cos2 = sincos(2.0 * orientation)
+        return Turn(cos2, sin2, jnp.exp(-2.0 * variance))
+
+
 class Factors(NamedTuple):
     """One iterate of the variational factors; the auxiliary points enter by their mean and scatter only."""
 
@@ -74,6 +90,9 @@ class Factors(NamedTuple):
     aux_mean: Vec2
     aux_scatter: Sym2
     aux_cov: Sym2
+    turn: Turn
+    """Of the orientation: carried from one iteration to the next, or the compiler would compute sine and cosine anew
+    for each of the many numbers that they enter."""
 
 
 def iterate(prior: VbState, stats: ScanStatistics, model: TrackingModel, q: Factors) -> Factors:
@@ -86,12 +105,12 @@ def iterate(prior: VbState, stats: ScanStatistics, model: TrackingModel, q: Fact
     """
     m, s, noise = stats.count, model.extent_scale, model.sensor_noise
     d1, d2 = q.shape.x / (s * q.scale.x), q.shape.y / (s * q.scale.y)
-    cos2, sin2 = jnp.cos(2.0 * q.orientation), jnp.sin(2.0 * q.orientation)
-    shrink = jnp.exp(-2.0 * q.orientation_var)
+    cos2, sin2, shrink = q.turn
     info = rotated_diagonal(d1, d2, shrink * cos2, shrink * sin2)  # A = E[L (sX)⁻¹ Lᵀ]
     residual = q.aux_mean - q.position
     psi = q.aux_scatter + m * (residual.outer() + q.position_cov + q.aux_cov)
 
+    psi, info = once((psi, info), s)
     position_cov = fuse(prior.kinematics.position_cov, m * info)
     shift = q.aux_mean - prior.kinematics.position
     position = prior.kinematics.position + position_cov @ (info @ (m * shift))
@@ -112,7 +131,10 @@ def iterate(prior: VbState, stats: ScanStatistics, model: TrackingModel, q: Fact
     slope = curvature * (q.orientation - prior.orientation) - (d1 - d2) * across
     orientation_var = prior.orientation_var / (1.0 + prior.orientation_var * curvature)
     orientation = prior.orientation + orientation_var * slope
-    return Factors(position, position_cov, orientation, orientation_var, shape, scale, aux_mean, aux_scatter, aux_cov)
+    turn = Turn.of(orientation, orientation_var)
+    return Factors(
+        position, position_cov, orientation, orientation_var, shape, scale, aux_mean, aux_scatter, aux_cov, turn
+    )
 
 
 def update(state: VbState, scan: Measurements, model: TrackingModel, iterations: int) -> VbState:
@@ -134,6 +156,7 @@ def update(state: VbState, scan: Measurements, model: TrackingModel, iterations:
             zero,
             model.extent_scale * state.scale.y / (state.shape.y - 1.0),
         ),
+        turn=Turn.of(state.orientation, state.orientation_var),
     )
     q = jax.lax.fori_loop(0, iterations, lambda _, q: iterate(state, stats, model, q), start)
     belief = kinematics.with_position(state.kinematics, q.position, q.position_cov)

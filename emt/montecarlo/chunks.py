@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from emt.keys import filter_number
 from emt.models.state_space.measurements import Measurement
 from emt.montecarlo.fields import truth_fields
 from emt.montecarlo.program import Program, Simulation
@@ -90,9 +91,11 @@ def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, n
     return {name: np.asarray(value) for name, value in arrays.items()}
 
 
-QUICK_COMPILATION: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""Options of XLA for programs that run once on few runs: compiling takes longer than running. Results differ in
-rounding."""
+COMPILATION: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+"""Options of XLA on CPUs: these compile twice as fast, and run as fast wherever `linalg.once` keeps the compiler from
+computing the same thing again and again."""
+QUICK_COMPILATION: dict[str, Any] = COMPILATION | {"xla_backend_optimization_level": 0}
+"""The same for programs that run once on few runs: compiling takes longer than running. Results differ in rounding."""
 
 
 class Engine:
@@ -104,7 +107,8 @@ class Engine:
 
     def __init__(self, program: Program, seed: int, chunk_size: int, *, quick: bool = False):
         self.program, self.seed, self.chunk_size = program, jnp.asarray(seed), chunk_size
-        self._options = QUICK_COMPILATION if quick and jax.default_backend() == "cpu" else None
+        on_cpu = QUICK_COMPILATION if quick else COMPILATION
+        self._options = on_cpu if jax.default_backend() == "cpu" else None
         self._compiled: dict[str, Any] = {}
         self.seconds: dict[str, list[float]] = {label: [] for label in program.filter_params}
         """Wall-clock time of filter and metrics of each chunk so far, by filter."""
@@ -126,12 +130,17 @@ class Engine:
             on_start(name or "scenario")
             if not name:
                 return simulator.lower(program.world, self.seed, runs).compile(self._options)
-            arguments = (program.world, program.filter_params[name], self.seed, runs, shapes.scans, shapes.truth)
-            return program.scorer(name).lower(*arguments).compile(self._options)
+            arguments = self.arguments(name, runs, shapes.scans, shapes.truth)
+            return program.shared_scorer(name).lower(*arguments).compile(self._options)
 
         names = ["", *self.labels()]
         with ThreadPoolExecutor(WORKERS) as pool:
             self._compiled = dict(zip(names, pool.map(build, names), strict=True))
+
+    def arguments(self, label: str, runs, scans, target) -> tuple[Any, ...]:
+        """What the program of a filter is given."""
+        params = self.program.filter_params[label]
+        return self.program.world, params, self.seed, runs, scans, target, jnp.asarray(filter_number(label))
 
     def costs(self) -> dict[str, float]:
         """Microseconds per run and step of each filter with its metrics: the median over chunks.
@@ -153,9 +162,8 @@ class Engine:
         target, arrays = simulation.truth, {}
         tracked = n if experiment.traces else min(tracked, n)
         for label in self.labels():
-            params = program.filter_params[label]
+            arguments = self.arguments(label, runs, simulation.scans, target)
             started = time.perf_counter()
-            arguments = (world, params, self.seed, runs, simulation.scans, target)
             scores = jax.block_until_ready(self._compiled[label](*arguments))
             self.seconds[label].append(time.perf_counter() - started)
             if label == experiment.reference:

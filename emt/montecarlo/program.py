@@ -11,7 +11,7 @@ import numpy as np
 
 from emt.config.experiment import Experiment
 from emt.filters.base import guarded
-from emt.keys import Purpose, filter_key, purpose_key, run_key
+from emt.keys import Purpose, filter_key, filter_number, purpose_key, run_key
 from emt.metrics.base import Metric, has
 from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
 from emt.montecarlo.world import drawn_prior, limits_of, model_of, prior_of
@@ -20,7 +20,7 @@ from emt.types import Articulated, Estimate, Info, Measurements, Point, Prior, S
 
 
 class Simulation(NamedTuple):
-    """Truth and scans of a chunk of runs; leading axes run, time."""
+    """Truth and scans, screened, of a chunk of runs; leading axes run, time."""
 
     truth: Truth
     scans: Measurements
@@ -89,13 +89,16 @@ class Program:
         """Truth and scans of one run."""
         scenario, key = self.make_scenario(world.scenario), run_key(seed, run)
         truth = scenario.sample_truth(purpose_key(key, Purpose.TRUTH))
-        return Simulation(truth, scenario.sample_scans(truth, purpose_key(key, Purpose.MEASUREMENTS)))
+        scans = scenario.sample_scans(truth, purpose_key(key, Purpose.MEASUREMENTS))
+        return Simulation(truth, scans)
 
-    def score_run(self, label: str, world, params, seed, run, scans: Measurements, target: Truth) -> Scores:
-        """Scores of one filter in one run."""
+    def score_run(
+        self, label: str, world, params, seed, run, scans: Measurements, target: Truth, number=None
+    ) -> Scores:
+        """Scores of one filter in one run; its random numbers are those of the label, or of another `number`."""
         flt = guarded(self.make_filter[label](params, world.model))
         tracker = Tracker(flt, self.prior_of_run(world.prior, seed, run), self.experiment.start_with == "predict")
-        key = filter_key(run_key(seed, run), label)
+        key = filter_key(run_key(seed, run), filter_number(label) if number is None else number)
         dt = self.make_scenario(world.scenario).dt
         return score(tracker, self.rules_for(label), target, scans, dt, key, world.limits)
 
@@ -173,3 +176,8 @@ class Program:
     def scorer(self, label: str) -> Callable[..., Scores]:
         """Jitted (world, params, seed, runs, scans, target) -> Scores of one filter, mapped over runs."""
         return jax.jit(jax.vmap(partial(self.score_run, label), in_axes=(None, None, None, 0, 0, 0)))
+
+    def shared_scorer(self, label: str) -> Callable[..., Scores]:
+        """The same with the number of the filter (see `keys.filter_number`) as a last argument: filters that differ in
+        label and parameters only are one program, which the cache keeps once."""
+        return jax.jit(jax.vmap(partial(self.score_run, label), in_axes=(None, None, None, 0, 0, 0, None)))

@@ -12,16 +12,22 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field, NonNegativeInt, PositiveInt
 from scipy.stats import poisson
 
+from emt.draws import normal_pairs, uniform_pairs, unit_disc
 from emt.keys import step_key
-from emt.linalg import Mat2
+from emt.linalg import Mat2, Vec2, once
 from emt.matrices import Matrix
+from emt.scans import prepared
 from emt.settings import NoiseCovariance, Settings
+from emt.trigonometry import sincos
 from emt.types import Measurements, Scalar, Traced, Truth
 
 OVERFLOW_PROBABILITY = 1e-9
 """Bound on the probability that any scan of a whole experiment exceeds the capacity."""
 LARGEST_EXPERIMENT = 1_000_000
 """Runs for which the bound holds at least; more runs enlarge the capacity, which changes no detection."""
+
+VECTOR = 8
+"""Capacities are multiples of it: the doubles that a processor handles at once."""
 
 
 class PoissonCount(Settings):
@@ -72,7 +78,7 @@ def capacity_for(settings: DetectionSettings, n_steps: int, runs: int) -> int:
     candidates = np.arange(1, int(settings.count.mean + 40.0 * math.sqrt(settings.count.mean) + 100.0))
     # the survival function itself: its inverse is not accurate this far out
     enough = candidates[poisson.sf(candidates, settings.count.mean) < per_scan]
-    return max(int(enough[0]), settings.count.minimum)
+    return -(-max(int(enough[0]), settings.count.minimum) // VECTOR) * VECTOR
 
 
 def noise_root(noise_cov: Matrix) -> Mat2:
@@ -89,48 +95,61 @@ def params_of(settings: DetectionSettings) -> DetectionParams:
     return DetectionParams(mean, noise_root(settings.noise_cov))
 
 
-def poisson_count(key: PRNGKeyArray, mean: Scalar, capacity: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """A Poisson number by inversion of its distribution function, up to `capacity`; and whether it was larger.
+def poisson_cdf(mean: Scalar, capacity: int) -> Float[Array, "n"]:
+    """Distribution function of a Poisson number at 0 to `capacity`."""
+    k = jnp.arange(capacity + 1, dtype=mean.dtype)
+    return jnp.cumsum(jnp.exp(k * jnp.log(mean) - mean - jax.scipy.special.gammaln(k + 1.0)))
+
+
+def poisson_count(key: PRNGKeyArray, cdf: Float[Array, "n"]) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """A Poisson number by inversion of its distribution function, up to the capacity; and whether it was larger.
 
     Inversion uses one uniform whatever the mean, so the number does not depend on batching or capacity.
     """
-    k = jnp.arange(capacity + 1, dtype=mean.dtype)
-    cdf = jnp.cumsum(jnp.exp(k * jnp.log(mean) - mean - jax.scipy.special.gammaln(k + 1.0)))
-    count = (jax.random.uniform(key, dtype=mean.dtype) > cdf).sum()
+    capacity = cdf.shape[0] - 1
+    count = (jax.random.uniform(key, dtype=cdf.dtype) > cdf).sum()
     return jnp.minimum(count, capacity), count > capacity
 
 
-def unit_disc(key: PRNGKeyArray, n: int, dtype) -> Float[Array, "n 2"]:
-    """Points uniform in the unit disc."""
-    u = jax.random.uniform(key, (n, 2), dtype)
-    radius, angle = jnp.sqrt(u[:, 0]), 2.0 * jnp.pi * u[:, 1]
-    return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=1)
+def sample_source(key: PRNGKeyArray, kind: str, n: int, dtype) -> Vec2:
+    """Points on an object with unit semi-axes."""
+    if kind == "uniform":
+        return unit_disc(key, n, dtype)
+    if kind == "gaussian":
+        return normal_pairs(key, n, dtype)
+    u, v = uniform_pairs(key, n, dtype)
+    side = math.sqrt(0.5)
+    return Vec2(side * (2.0 * u - 1.0), side * (2.0 * v - 1.0))
+
+
+def body_frame(truth: Truth) -> Mat2:
+    """L diag(l1, l2): from an object with unit semi-axes to the true one (m)."""
+    l1, l2 = truth.ellipse.semi_axes
+    sine, cosine = sincos(truth.ellipse.orientation)
+    return Mat2(l1 * cosine, -l2 * sine, l1 * sine, l2 * cosine)
 
 
 def sample_scan(
-    key: PRNGKeyArray, truth: Truth, settings: DetectionSettings, params: DetectionParams, capacity: int
+    key: PRNGKeyArray, truth: Truth, settings: DetectionSettings, params: DetectionParams, cdf: Float[Array, "n"]
 ) -> Measurements:
-    """One scan of the object."""
+    """One scan of the object; its capacity is one less than the length of `cdf`."""
     count_key, source_key, noise_key = (jax.random.fold_in(key, i) for i in range(3))
+    capacity = cdf.shape[0] - 1
     if isinstance(settings.count, PoissonCount):
-        count, overflow = poisson_count(count_key, params.mean_count, capacity)
+        count, overflow = poisson_count(count_key, cdf)
         count = jnp.minimum(jnp.maximum(count, settings.count.minimum), capacity)
     else:
         count = jnp.asarray(min(settings.count.count, capacity))
         overflow = jnp.asarray(settings.count.count > capacity)
-    dtype = truth.position.dtype
-    if settings.source == "uniform":
-        source = unit_disc(source_key, capacity, dtype)
-    elif settings.source == "box":
-        side = math.sqrt(0.5)
-        source = jax.random.uniform(source_key, (capacity, 2), dtype, -side, side)
-    else:
-        source = jax.random.normal(source_key, (capacity, 2), dtype)
-    noise = jax.random.normal(noise_key, (capacity, 2), dtype)
-    axes, turn, chol = truth.ellipse.semi_axes, Mat2.rotation(truth.ellipse.orientation), params.noise_chol
-    along, across = axes[0] * source[:, 0], axes[1] * source[:, 1]
-    x = truth.position[0] + turn.xx * along + turn.xy * across + chol.xx * noise[:, 0]
-    y = truth.position[1] + turn.yx * along + turn.yy * across + chol.yx * noise[:, 0] + chol.yy * noise[:, 1]
+    dtype, chol = truth.position.dtype, params.noise_chol
+    source = sample_source(source_key, settings.source, capacity, dtype)
+    noise = normal_pairs(noise_key, capacity, dtype)
+    body = once(body_frame(truth), params.mean_count)
+    # drawn once: the compiler would draw anew for each coordinate and each statistic
+    source, noise = once((source, noise), params.mean_count)
+    x = truth.position[0] + body.xx * source.x + body.xy * source.y + chol.xx * noise.x
+    y = truth.position[1] + body.yx * source.x + body.yy * source.y + chol.yx * noise.x + chol.yy * noise.y
+    x, y = once((x, y), params.mean_count)
     return Measurements(jnp.stack([x, y], axis=1), jnp.arange(capacity) < count, overflow)
 
 
@@ -138,5 +157,11 @@ def sample_scans(
     key: PRNGKeyArray, truth: Truth, settings: DetectionSettings, params: DetectionParams, capacity: int
 ) -> Measurements:
     """One scan per step of a true track; each step has its own key, so a longer track extends a shorter one."""
-    steps = jnp.arange(truth.position.shape[0])
-    return jax.vmap(lambda step, now: sample_scan(step_key(key, step), now, settings, params, capacity))(steps, truth)
+    cdf = poisson_cdf(jnp.asarray(params.mean_count, truth.position.dtype), capacity)
+
+    def step(step_and_truth) -> Measurements:
+        step, now = step_and_truth
+        return prepared(sample_scan(step_key(key, step), now, settings, params, cdf))
+
+    # one step after the other: the draws of all runs at one step fit the cache
+    return jax.lax.map(step, (jnp.arange(truth.position.shape[0]), truth))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emt.filters.base import TrackingModel, as_scan
+from emt.filters.base import TrackingModel
 from emt.filters.imm import ImmSettings
 from emt.filters.lan_li import LanLiSettings
 from emt.filters.moment_ukf import MomentUkfSettings
@@ -14,6 +14,7 @@ from emt.filters.unscented import Gaussian, Spread, square_root
 from emt.linalg import Sym2, Vec2
 from emt.models.motion import WhiteAcceleration
 from emt.registry import FILTERS
+from emt.scans import as_scan
 from emt.types import Ellipse, Filter, Prior
 from tests.filters.cases import FAST_COMPILE, cast
 from tests.reference import lan_li as lan_li_oracle

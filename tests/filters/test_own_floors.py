@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from emt.filters import feldmann, gp_ett, mem_ekf_star, vb_random_matrix
-from emt.filters.base import TrackingModel, as_scan
+from emt.filters.base import TrackingModel
 from emt.filters.kinematics import Kinematics
 from emt.linalg import Chol3, Sym2, Vec2
 from emt.models.motion import WhiteAcceleration
+from emt.scans import as_scan
 from emt.status import FAILURE, Status
 from emt.types import Ellipse, Prior
 from tests.filters.cases import CASES, GP, MEM_COV, cast

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from emt.filters import sampled_posterior as sampled
-from emt.filters.base import TrackingModel, as_scan, guarded, scan_statistics
+from emt.filters.base import TrackingModel, guarded
 from emt.linalg import Sym2
 from emt.models.motion import WhiteAcceleration
+from emt.scans import as_scan, scan_statistics
 from emt.types import Ellipse, Prior
 from tests.filters.cases import FAST_COMPILE, cast
 from tests.reference.sampled_posterior import sampled_posterior

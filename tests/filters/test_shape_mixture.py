@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from emt.conformance.sampling_kinds import ARM
-from emt.filters.base import as_scan, guarded
+from emt.filters.base import guarded
 from emt.filters.connected_model import ConnectedModel
 from emt.filters.shape_mixture import Belief, build, merger
 from emt.filters.shape_mixture_settings import ShapeMixtureSettings
 from emt.linalg import Sym2
 from emt.montecarlo.program import cast
 from emt.sampling.rules import lcd_set
+from emt.scans import as_scan
 from emt.shapes.articulated import sources
 from emt.shapes.connected import ConnectedSettings, connected
 from emt.types import Measurements, StatePrior

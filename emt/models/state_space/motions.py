@@ -11,6 +11,7 @@ import numpy as np
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from emt.draws import normals
 from emt.linalg import Vec2, cholesky, forward_solve, semidefinite_root
 from emt.models.motion import MotionNoise
 from emt.models.turn import coordinated_turn
@@ -36,7 +37,7 @@ class Motion:
     def draws(self, key: PRNGKeyArray, count: int, dt: Scalar) -> Float[Array, "count n"]:
         """Independent draws of the noise."""
         root = semidefinite_root(self.noise_cov(dt))
-        return jax.random.normal(key, (count, root.shape[0]), root.dtype) @ root.T
+        return normals(key, (count, root.shape[0]), root.dtype) @ root.T
 
     def log_density(self, noise: State, dt: Scalar) -> Scalar:
         """Log density of the noise; its covariance must have full rank."""

@@ -288,8 +288,8 @@ def once(values, known: Real):
 
 def is_positive_definite(cov: Sym2) -> Real:
     """Whether the matrix is finite and positive definite."""
-    finite = jnp.isfinite(cov.xx) & jnp.isfinite(cov.xy) & jnp.isfinite(cov.yy)
-    return finite & (cov.xx > 0.0) & (cov.det() > 0.0)
+    det = cov.det()  # infinite, negative or not a number if an entry is not finite
+    return (cov.xx > 0.0) & (det > 0.0) & (det < jnp.inf)
 
 
 def all_finite(tree) -> Real:

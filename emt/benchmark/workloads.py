@@ -90,7 +90,7 @@ def load_workload(name: str, overrides: Sequence[str] = ()) -> Loaded:
 
 def options_of(engine: Engine) -> dict[str, Any] | None:
     """What an engine tells the compiler: parts that are timed alone have to be compiled like the whole."""
-    return engine._options
+    return engine.options
 
 
 def compiled_filter(

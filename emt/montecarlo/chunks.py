@@ -4,7 +4,7 @@ import itertools
 import statistics
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from emt.keys import filter_number
 from emt.models.state_space.measurements import Measurement
+from emt.montecarlo.devices import chunks_at_once
 from emt.montecarlo.fields import truth_fields
 from emt.montecarlo.program import Program, Simulation
 from emt.montecarlo.run import Scores, as_truth
@@ -92,10 +93,10 @@ def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, n
 
 
 COMPILATION: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
-"""Options of XLA on CPUs: these compile twice as fast, and run as fast wherever `linalg.once` keeps the compiler from
-computing the same thing again and again."""
+"""Options of XLA for filters on CPUs: these compile twice as fast, and run as fast wherever `linalg.once` keeps the
+compiler from computing the same thing again and again. The simulator, compiled once, runs faster without."""
 QUICK_COMPILATION: dict[str, Any] = COMPILATION | {"xla_backend_optimization_level": 0}
-"""The same for programs that run once on few runs: compiling takes longer than running. Results differ in rounding."""
+"""Options for programs that run once on few runs: compiling takes longer than running. Results differ in rounding."""
 
 
 class Engine:
@@ -103,12 +104,25 @@ class Engine:
 
     Args:
         quick: compile in a hurry, for a few runs.
+        devices: where to run; by default all that this process has. They change no result.
     """
 
-    def __init__(self, program: Program, seed: int, chunk_size: int, *, quick: bool = False):
+    def __init__(
+        self,
+        program: Program,
+        seed: int,
+        chunk_size: int,
+        *,
+        quick: bool = False,
+        devices: Sequence[Any] | None = None,
+    ):
         self.program, self.seed, self.chunk_size = program, jnp.asarray(seed), chunk_size
-        on_cpu = QUICK_COMPILATION if quick else COMPILATION
-        self._options = on_cpu if jax.default_backend() == "cpu" else None
+        self.devices = list(devices or jax.local_devices())
+        self.at_once = chunks_at_once(chunk_size, self.devices)
+        on_cpu = jax.default_backend() == "cpu"
+        self.options = (QUICK_COMPILATION if quick else COMPILATION) if on_cpu else None
+        """Options of XLA for filters."""
+        self.simulator_options = QUICK_COMPILATION if on_cpu and quick else None
         self._compiled: dict[str, Any] = {}
         self.seconds: dict[str, list[float]] = {label: [] for label in program.filter_params}
         """Wall-clock time of filter and metrics of each chunk so far, by filter."""
@@ -122,16 +136,16 @@ class Engine:
         """Compiles simulator and filters, two at a time; again is free."""
         if self._compiled:
             return
-        program, runs = self.program, jnp.zeros(self.chunk_size, int)
-        simulator = program.simulator()
+        program, runs = self.program, jnp.zeros(self.chunk_size * self.at_once, int)
+        simulator = program.simulator(self.devices)
         shapes = jax.eval_shape(simulator, program.world, self.seed, runs)
 
         def build(name: str):
             on_start(name or "scenario")
             if not name:
-                return simulator.lower(program.world, self.seed, runs).compile(self._options)
+                return simulator.lower(program.world, self.seed, runs).compile(self.simulator_options)
             arguments = self.arguments(name, runs, shapes.scans, shapes.truth)
-            return program.shared_scorer(name).lower(*arguments).compile(self._options)
+            return program.shared_scorer(name, self.devices).lower(*arguments).compile(self.options)
 
         names = ["", *self.labels()]
         with ThreadPoolExecutor(WORKERS) as pool:
@@ -155,44 +169,69 @@ class Engine:
 
         An experiment that asks for traces gets those of all runs.
         """
-        program, n = self.program, stop - start
-        experiment, world = program.experiment, program.world
-        runs = jnp.asarray(chunk_runs(start, stop, self.chunk_size))
-        simulation = jax.block_until_ready(self._compiled[""](world, self.seed, runs))
-        target, arrays = simulation.truth, {}
-        tracked = n if experiment.traces else min(tracked, n)
+        return self.run_group([(start, stop)], tracked=tracked)[0]
+
+    def run_group(self, ranges: Sequence[tuple[int, int]], *, tracked: int = 0) -> list[dict[str, np.ndarray]]:
+        """The arrays of up to `at_once` chunks in one call of each program; the first chunk is tracked."""
+        program, experiment = self.program, self.program.experiment
+        size = self.chunk_size
+        filled = [*ranges, *[ranges[-1]] * (self.at_once - len(ranges))]
+        runs = jnp.asarray(np.concatenate([chunk_runs(start, stop, size) for start, stop in filled]))
+        simulation = jax.block_until_ready(self._compiled[""](program.world, self.seed, runs))
+        target, found = simulation.truth, [{} for _ in ranges]
+
+        def part(tree: Any, k: int) -> Any:
+            """The share of one chunk."""
+            if self.at_once == 1:
+                return tree
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[k * size : (k + 1) * size], tree)
+
+        def traced(k: int) -> int:
+            n = ranges[k][1] - ranges[k][0]
+            return n if experiment.traces else min(tracked, n) * (k == 0)
+
         for label in self.labels():
             arguments = self.arguments(label, runs, simulation.scans, target)
             started = time.perf_counter()
             scores = jax.block_until_ready(self._compiled[label](*arguments))
-            self.seconds[label].append(time.perf_counter() - started)
+            self.seconds[label].append((time.perf_counter() - started) / len(ranges))
             if label == experiment.reference:
                 target = jax.vmap(as_truth)(scores.track)
-            arrays |= score_arrays(label, scores, n)
-            if tracked:
-                arrays |= track_arrays(label, scores, tracked)
-        if tracked:
-            arrays |= scan_arrays(program, simulation, tracked)
-        return arrays
+            for k, (start, stop) in enumerate(ranges):
+                mine = part(scores, k)
+                found[k] |= score_arrays(label, mine, stop - start)
+                if traced(k):
+                    found[k] |= track_arrays(label, mine, traced(k))
+        for k in range(len(ranges)):
+            if traced(k):
+                found[k] |= scan_arrays(program, part(simulation, k), traced(k))
+        return found
 
     def run_chunks(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
-        """(start, stop, arrays) of several chunks in order, two of them in work at a time; run 0 comes with tracks.
+        """(start, stop, arrays) of several chunks in order, two calls of them in work at a time; run 0 comes with
+        tracks.
 
         Two chunks on two cores take less time than each of them spread over both.
         """
+        remaining = iter(ranges)
+        groups = iter(lambda: list(itertools.islice(remaining, self.at_once)), [])
         with ThreadPoolExecutor(WORKERS) as pool:
             waiting: deque = deque()
+
+            def first() -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+                group, future = waiting.popleft()
+                for (start, stop), arrays in zip(group, future.result(), strict=True):
+                    yield start, stop, arrays
+
             try:
-                for start, stop in ranges:
-                    waiting.append((start, stop, pool.submit(self.run_chunk, start, stop, tracked=int(start == 0))))
+                for group in groups:
+                    waiting.append((group, pool.submit(self.run_group, group, tracked=int(group[0][0] == 0))))
                     if len(waiting) > WORKERS:
-                        first, last, future = waiting.popleft()
-                        yield first, last, future.result()
+                        yield from first()
                 while waiting:
-                    first, last, future = waiting.popleft()
-                    yield first, last, future.result()
+                    yield from first()
             finally:
-                for _, _, future in waiting:
+                for _, future in waiting:
                     future.cancel()
 
 

@@ -1,6 +1,6 @@
 """An experiment as compiled functions of (seed, run numbers): the simulator and one program per filter."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,6 +13,7 @@ from emt.config.experiment import Experiment
 from emt.filters.base import guarded
 from emt.keys import Purpose, filter_key, filter_number, purpose_key, run_key
 from emt.metrics.base import Metric, has
+from emt.montecarlo.devices import over_runs
 from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
 from emt.montecarlo.world import drawn_prior, limits_of, model_of, prior_of
 from emt.registry import FILTERS, SCENARIOS
@@ -169,15 +170,16 @@ class Program:
         having = [label for label in self.filter_params if label not in self.without(metric)]
         return metric.dof(self.estimate_of(having[0])) if metric.dof is not None and having else 0
 
-    def simulator(self) -> Callable[..., Simulation]:
+    def simulator(self, devices: Sequence[Any] | None = None) -> Callable[..., Simulation]:
         """Jitted (world, seed, runs) -> Simulation, mapped over runs."""
-        return jax.jit(jax.vmap(self.simulate_run, in_axes=(None, None, 0)))
+        return over_runs(self.simulate_run, (None, None, 0), devices or jax.devices()[:1])
 
     def scorer(self, label: str) -> Callable[..., Scores]:
         """Jitted (world, params, seed, runs, scans, target) -> Scores of one filter, mapped over runs."""
-        return jax.jit(jax.vmap(partial(self.score_run, label), in_axes=(None, None, None, 0, 0, 0)))
+        return over_runs(partial(self.score_run, label), (None, None, None, 0, 0, 0), jax.devices()[:1])
 
-    def shared_scorer(self, label: str) -> Callable[..., Scores]:
+    def shared_scorer(self, label: str, devices: Sequence[Any] | None = None) -> Callable[..., Scores]:
         """The same with the number of the filter (see `keys.filter_number`) as a last argument: filters that differ in
         label and parameters only are one program, which the cache keeps once."""
-        return jax.jit(jax.vmap(partial(self.score_run, label), in_axes=(None, None, None, 0, 0, 0, None)))
+        axes = (None, None, None, 0, 0, 0, None)
+        return over_runs(partial(self.score_run, label), axes, devices or jax.devices()[:1])

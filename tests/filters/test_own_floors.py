@@ -93,9 +93,10 @@ def test_mem_pivots_survive_rounding():
 
     def pivots(angle):
         axes = Vec2(jnp.asarray(1000.0), jnp.asarray(1e-9))
-        state = mem_ekf_star.MemState(belief, angle, axes, chol)
+        turn = mem_ekf_star.rotation(angle)
+        state = mem_ekf_star.Now(belief.position, belief.position_cov, angle, axes, chol, turn)
         point = Vec2(300.0 * jnp.cos(angle + 0.01), 300.0 * jnp.sin(angle + 0.01))
-        found = mem_ekf_star.update_with_point(state, point, model)
+        found = mem_ekf_star.update_with_point(state, point, jnp.asarray(True), model)
         return jnp.stack(jax.tree.leaves(found.shape_chol)), found.orientation
 
     factors, orientation = jax.vmap(pivots)(jnp.linspace(0.0, 3.0, 64))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import quad
 
+from emt.draws import normals
 from emt.filters.particle import ParticleState, moments
 from emt.filters.resampling import effective_fraction, systematic
 from emt.models.motion import WhiteAcceleration
@@ -94,14 +95,14 @@ def draws_of(world: World, k: int, shape: tuple[int, int]):
     """(uniform, normals of the motion, normals of the proposal) of a step."""
     predict_key, update_key = jax.random.split(jax.random.fold_in(world.key, k))
     u_key, noise_key = jax.random.split(predict_key)
-    normals = [np.asarray(jax.random.normal(key, shape)) for key in (noise_key, update_key)]
-    return float(jax.random.uniform(u_key)), *normals
+    gaussian = [np.asarray(normals(key, shape, jnp.float64)) for key in (noise_key, update_key)]
+    return float(jax.random.uniform(u_key)), *gaussian
 
 
 def start_of(world: World) -> np.ndarray:
     """Particles drawn from the prior."""
     n = len(world.prior.mean)
-    draws = np.asarray(jax.random.normal(world.key, (N, n)))
+    draws = np.asarray(normals(world.key, (N, n), jnp.float64))
     return np.asarray(world.prior.mean) + draws @ np.linalg.cholesky(np.asarray(world.prior.cov)).T
 
 

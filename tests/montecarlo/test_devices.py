@@ -40,7 +40,8 @@ print("same bits in", len(alone), "chunks of", len(alone[0][2]), "arrays")
 
 def test_the_number_of_devices_changes_no_bit(tmp_path):
     """Of results, tracks and scans, for a filter in closed form and one that goes through the points."""
-    mem = "  mem: {kind: mem_ekf_star, shape_cov: {diagonal: [0.05, 1, 0.3]}, shape_noise: {diagonal: [0.01, 0.1, 0.1]}}\n"
+    cov = "{diagonal: [0.05, 1, 0.3]}"
+    mem = f"  mem: {{kind: mem_ekf_star, shape_cov: {cov}, shape_noise: {cov}}}\n"
     path = write(tmp_path, TEXT.replace("metrics:", mem + "metrics:"))
     flags = "--xla_force_host_platform_device_count=8"
     found = subprocess.run(

@@ -1,4 +1,8 @@
-"""What runs on a worker: one chunk is one task; engines are built and compiled once and kept for the next chunks."""
+"""What runs on a worker: one chunk is one task; engines are built and compiled once and kept for the next chunks.
+
+XLA spreads a chunk over the cores it finds. Chunks of one process are computed one after the other, even in a worker of
+several threads: programs that run side by side can block each other, each waiting for threads that the other holds.
+"""
 
 import platform
 import threading
@@ -20,7 +24,7 @@ MAX_ENGINES = 2
 """Experiments whose programs a worker keeps."""
 
 _engines: "OrderedDict[str, Engine]" = OrderedDict()
-_building = threading.Lock()
+_building, _running = threading.Lock(), threading.Lock()
 
 
 class Result(NamedTuple):
@@ -47,9 +51,10 @@ def compute(parcel: Parcel, start: int, stop: int, tracked: int) -> Result:
     except ParcelError as error:
         raise ParcelError(f"the worker on {platform.node()} {error}") from error
     compile_seconds = time.perf_counter() - began if is_new else 0.0
-    arrays = engine.run_chunk(start, stop, tracked=tracked)
-    # taken out again, so that a worker that lives long does not collect them
-    seconds = {label: found.pop() for label, found in engine.seconds.items() if found}
+    with _running:
+        arrays = engine.run_chunk(start, stop, tracked=tracked)
+        # taken out again, so that a worker that lives long does not collect them
+        seconds = {label: found.pop() for label, found in engine.seconds.items() if found}
     return Result(arrays, seconds, compile_seconds, own_environment())
 
 

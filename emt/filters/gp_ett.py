@@ -5,14 +5,14 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float
 from pydantic import PositiveInt
 
-from emt.filters.base import TrackingModel, innovation_info
+from emt.filters.base import TrackingModel, innovation_info, keep_if
 from emt.linalg import Sym2, Vec2
 from emt.registry import FILTERS
+from emt.scans import filled_slots
 from emt.settings import (
     AngleVariance,
     LengthVariance,
@@ -160,27 +160,33 @@ def noise_floor(h: Float[Array, "n n_state"], cov: Float[Array, "n_state n_state
 
 
 def update(state: GpState, scan: Measurements, gp: Contour, model: TrackingModel, params: Params) -> GpState:
-    """One extended Kalman update with all points of the scan, in Joseph form.
+    """One extended Kalman update with all points of the scan.
+
+    All are linearised about the prediction and their noises are independent, so it makes no difference that they are
+    taken one after the other, each in Joseph form; and no factorisation is needed, with which XLA's CPU backend can
+    wait for itself for ever (see `linalg.cholesky`).
 
     Deviation from the paper: the noise of a point is raised by the rounding error of the innovation covariance, without
-    which this has no Cholesky factor when the sensor noise is far smaller than the prediction's uncertainty.
+    which this is not definite when the sensor noise is far smaller than the prediction's uncertainty.
     """
-    n_points, real = scan.mask.shape[0], scan.mask[:, None]
     # padding sits at the centre, where `measurement` and its derivatives are finite
     expected, jacobian, noise = jax.vmap(lambda point: measurement(state.mean, Vec2.of(point), gp, model, params))(
         scan.points
     )
-    real = scan.mask[:, None]
-    innovation = jnp.where(real, scan.points - expected, 0.0).reshape(2 * n_points)
-    # padding rows: no information (zero Jacobian), unit noise
-    h = jnp.where(real[:, :, None], jacobian, 0.0).reshape(2 * n_points, -1)
-    r = jax.scipy.linalg.block_diag(*jnp.where(real[:, :, None], noise, jnp.eye(2, dtype=noise.dtype)))
-    r = r + noise_floor(h, state.cov) * jnp.eye(2 * n_points, dtype=r.dtype)
-    innovation_cov = symmetrise(h @ state.cov @ h.T + r)
-    gain = cho_solve(cho_factor(innovation_cov, lower=True), h @ state.cov).T
-    rest = jnp.eye(state.mean.shape[0], dtype=state.mean.dtype) - gain @ h
-    cov = rest @ state.cov @ rest.T + gain @ r @ gain.T
-    return GpState(state.mean + gain @ innovation, symmetrise(cov))
+    h = jnp.where(scan.mask[:, None, None], jacobian, 0.0)
+    floor = noise_floor(h.reshape(-1, h.shape[2]), state.cov) * jnp.eye(2, dtype=h.dtype)
+
+    def one(j, now: GpState) -> GpState:
+        rows, r = jacobian[j], noise[j] + floor
+        innovation = scan.points[j] - expected[j] - rows @ (now.mean - state.mean)
+        cross = rows @ now.cov
+        spread = Sym2.of(symmetrise(cross @ rows.T + r))
+        gain = cross.T @ spread.inverse().array()
+        half = now.cov - gain @ cross
+        cov = half - (half @ rows.T) @ gain.T + gain @ r @ gain.T
+        return keep_if(scan.mask[j], GpState(now.mean + gain @ innovation, symmetrise(cov)), now)
+
+    return jax.lax.fori_loop(0, filled_slots(scan), one, state)
 
 
 def symmetrise(m: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -1,0 +1,110 @@
+"""Mapping by a trailing axis, loops with one bound, and values computed once change no result."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from emt.filters.moment_ukf import MomentUkfSettings
+from emt.filters.unscented import Gaussian, merge_gaussians, product, square_root
+from emt.lanes import lanes_last, total
+from emt.linalg import once
+from emt.scans import as_scan, filled_slots, is_seen, prepared, scan_statistics, screen
+from tests.filters.cases import FAST_COMPILE
+from tests.filters.test_moments_and_modes import CT, CV, built, prior
+
+RNG = np.random.default_rng(5)
+RUNS, N = 6, 4
+
+
+def covariances() -> jnp.ndarray:
+    factors = RNG.normal(size=(RUNS, N, N))
+    return jnp.asarray(factors @ factors.transpose(0, 2, 1) + 0.1 * np.eye(N))
+
+
+def merged(weights, belief: Gaussian):
+    """Square root of a mixture of a belief and its mirror image."""
+    means, covs = jnp.stack([belief.mean, -belief.mean]), jnp.stack([product(belief.root)] * 2)
+    mean, cov = merge_gaussians(weights, means, covs)
+    return Gaussian(mean, square_root(cov))
+
+
+def test_runs_on_the_last_axis_give_what_runs_on_the_first_give():
+    beliefs = Gaussian(jnp.asarray(RNG.normal(size=(RUNS, N))), jax.vmap(square_root)(covariances()))
+    weights = jnp.asarray(RNG.dirichlet(np.ones(2), size=RUNS))
+    plain, last = jax.vmap(merged)(weights, beliefs), jax.vmap(lanes_last(merged))(weights, beliefs)
+    for ours, theirs in zip(jax.tree.leaves(last), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
+
+
+def test_arguments_that_runs_share_are_shared():
+    beliefs = Gaussian(jnp.asarray(RNG.normal(size=(RUNS, N))), jax.vmap(square_root)(covariances()))
+    even = jnp.asarray([0.25, 0.75])
+    shared = jax.vmap(lanes_last(merged), in_axes=(None, 0))(even, beliefs)
+    plain = jax.vmap(merged, in_axes=(None, 0))(even, beliefs)
+    np.testing.assert_allclose(shared.root, plain.root, rtol=1e-12, atol=1e-13)
+    one = lanes_last(merged)(even, jax.tree.map(lambda leaf: leaf[2], beliefs))
+    np.testing.assert_allclose(one.mean, plain.mean[2], rtol=1e-12)
+
+
+def test_forward_derivatives_pass_through():
+    """As `emt tune` takes them, of one run and of many."""
+    cov = covariances()
+    direct = jax.vmap(lambda c: jax.jvp(square_root, (c,), (jnp.eye(N),))[1])(cov)
+    mapped = jax.jvp(jax.vmap(lanes_last(square_root)), (cov,), (jnp.broadcast_to(jnp.eye(N), cov.shape),))[1]
+    np.testing.assert_allclose(mapped, direct, rtol=1e-10, atol=1e-12)
+
+
+def test_the_sum_is_the_sum():
+    values = jnp.asarray(RNG.normal(size=(5, 3)))
+    np.testing.assert_allclose(total(values), values.sum(axis=0), rtol=1e-14)
+    np.testing.assert_array_equal(total(values[:1]), values[0])
+
+
+def test_once_changes_nothing():
+    values = {"a": jnp.asarray(RNG.normal(size=7)), "b": (jnp.asarray(2.0),)}
+    through = jax.jit(once)(values, jnp.asarray(0.25))
+    for ours, theirs in zip(jax.tree.leaves(through), jax.tree.leaves(values), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def scans(counts: list[int]):
+    """Scans with so many points, each with one hole."""
+    made = [as_scan(jnp.asarray(RNG.normal(size=(n, 2))), 9) for n in counts]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *made)
+
+
+def test_a_batch_loops_to_its_fullest_scan():
+    batch = scans([0, 3, 7, 1])
+    assert jax.vmap(filled_slots)(batch).tolist() == [7, 7, 7, 7]
+    assert [int(filled_slots(jax.tree.map(lambda leaf, k=k: leaf[k], batch))) for k in range(4)] == [0, 3, 7, 1]
+
+
+@pytest.mark.parametrize("settings", [CV, CT])
+def test_company_changes_no_image_moments(settings):
+    """A run beside fuller scans goes through more slots, and comes to the same."""
+    flt, key = built(MomentUkfSettings.model_validate(settings | {"augmented": False})), jax.random.key(0)
+
+    def one(scan):
+        return flt.update(flt.predict(flt.init(prior(), key), jnp.asarray(1.0), key), scan, key)
+
+    batch = scans([2, 8, 0, 5])
+    together = jax.jit(jax.vmap(one), compiler_options=FAST_COMPILE)(batch)
+    for k in range(4):
+        alone = jax.jit(one, compiler_options=FAST_COMPILE)(jax.tree.map(lambda leaf, k=k: leaf[k], batch))
+        for ours, theirs in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(ours[k], theirs, rtol=1e-11, atol=1e-12)
+
+
+def test_a_scan_is_prepared_once():
+    """Statistics and the screening travel with it, and are not computed again."""
+    points = jnp.asarray([[1.0, 2.0], [jnp.nan, 0.0], [3.0, -2.0]])
+    given = as_scan(points, 4)
+    clean = prepared(given)
+    assert bool(clean.skipped)
+    assert screen(clean) is clean
+    assert scan_statistics(clean) is clean.statistics
+    assert float(clean.statistics.count) == 2.0
+    np.testing.assert_array_equal(clean.statistics.mean.array(), [2.0, 0.0])
+    assert bool(is_seen(clean))
+    assert not bool(is_seen(prepared(as_scan(jnp.zeros((0, 2)), 2))))

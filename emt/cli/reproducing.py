@@ -13,9 +13,6 @@ import typer
 
 from emt.cli.errors import InterruptedRunError, UnusableError, expected_errors, say
 
-QUICK_STEPS = 50_000
-"""Steps of all runs (of all particles) of an experiment up to which compiling in a hurry saves more than it costs."""
-
 
 class Scale(StrEnum):
     """How many runs."""
@@ -135,10 +132,7 @@ def run_job(job: Job) -> tuple[str, str, str]:
     try:
         loaded = load_experiment(job.name, job.overrides)
         loaded = at_smoke_scale(loaded) if job.scale == Scale.smoke else loaded
-        experiment = loaded.experiment
-        steps = experiment.monte_carlo.runs * getattr(experiment.scenario, "n_steps", 1)
-        steps *= max(getattr(settings, "particles", 1) for settings in experiment.filters.values())
-        summary = run(loaded, job.folder, quick=steps <= QUICK_STEPS)
+        summary = run(loaded, job.folder)
     except expected_errors() as error:
         return job.name, "", str(error)
     return job.name, f"{summary['runs']} runs in {time.perf_counter() - began:.0f} s", ""

@@ -11,8 +11,7 @@ def systematic(weights: Float[Array, "n"], u: Scalar) -> Int[Array, "n"]:
 
     Counts how many positions lie below each cumulative weight instead of searching for each position: two cumulative
     sums and one scatter. In batches of 208 runs of 1,000 particles this takes half the time of a binary search per
-    position (as `blackjax.smc.resampling.systematic` does it), and a sixth of what drawing four normals per particle
-    takes; so no library is needed for it.
+    position (as `blackjax.smc.resampling.systematic` does it); so no library is needed for it.
 
     Source: Kitagawa 1996; Azimian 2005, section 3.2.
 

@@ -85,8 +85,7 @@ def estimate_status(estimate: Estimate) -> Int[Array, ""]:
     if isinstance(estimate.shape, Ellipse):
         sound = sound & (estimate.shape.semi_axes > 0.0).all()
     bits = jnp.where(sound, 0, int(Status.NOT_POSITIVE_DEFINITE))
-    # a covariance that is not finite is not definite either
-    return jnp.where(all_finite((estimate.mean, estimate.shape)), bits, int(Status.NON_FINITE))
+    return jnp.where(all_finite(estimate), bits, int(Status.NON_FINITE))
 
 
 class Guarded(NamedTuple):

@@ -24,7 +24,11 @@ SHORT = {
     "mem_ekf_star": ("scenario.steps=12",),
     "moment_ukf": ("scenario.steps=12",),
     "multiple_model": (),
-    "particle": ("scenario.steps=10", "filters.particle.particles=2000"),
+    "particle": (
+        "scenario.steps=10",
+        "filters.particle.particles=2000",
+        *(f"{part}.measurement.range_std=5" for part in ("scenario", "model")),
+    ),
     "shape_mixture": ("scenario.steps=25",),
 }
 """Settings that make a workload small; the legs of `multiple_model` fix its steps."""

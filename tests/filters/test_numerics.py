@@ -108,7 +108,7 @@ def test_gradients_are_finite_and_equal_finite_differences(case):
         scans=given.scans._replace(points=jnp.where(given.scans.mask[..., None], given.scans.points, jnp.nan))
     )
     gradient = jax.jit(
-        jax.grad(lambda leaves: loss(*track(case, with_inexact(dirty, leaves)))),
+        jax.jacfwd(lambda leaves: loss(*track(case, with_inexact(dirty, leaves)))),
         compiler_options=FAST_COMPILE,
     )(inexact(dirty))
     assert all(np.isfinite(np.asarray(g)).all() for g in gradient)

@@ -1,6 +1,6 @@
 """Uniform and Gaussian random numbers in pairs, one pair from each 64-bit block of the generator.
 
-`jax.random.normal` inverts the error function for each number; these take a third of its time on a CPU.
+`jax.random.normal` inverts the error function for each number, which takes a CPU longer.
 """
 
 import math
@@ -14,7 +14,10 @@ from emt.trigonometry import sincos_turns
 
 
 def uniform_pairs(key: PRNGKeyArray, n: int, dtype) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Two independent uniforms on (0, 1) each: odd multiples of 2⁻³³. A longer draw begins with a shorter one."""
+    """Two independent uniforms on (0, 1) each: odd multiples of 2⁻³³, in single precision rounded and so up to 1.
+
+    A longer draw begins with a shorter one.
+    """
     bits = jax.random.bits(key, (n,), jnp.uint64)
     halves = (bits >> 32).astype(jnp.uint32), bits.astype(jnp.uint32)
     first, second = ((half.astype(dtype) + 0.5) * 2.0**-32 for half in halves)

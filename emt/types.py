@@ -186,3 +186,4 @@ class Scenario(NamedTuple):
     """Seconds since the previous step; the first entry is used only if the tracker starts with a prediction."""
     sample_truth: Callable[[PRNGKeyArray], Truth]
     sample_scans: Callable[[Truth, PRNGKeyArray], Measurements]
+    """Scans may come screened, with their statistics (see `scans.prepared`): all filters are then spared it."""

@@ -14,8 +14,8 @@ from emt.benchmark.processes import COMMAND, ChildError, as_started_by_users
 from emt.reports.paper import TIMING_FILE
 from emt.reports.table import Column, Table
 
-STAGE = re.compile(r"(?P<name>[^\s:]+): (?P<stage>compiling|running|reporting|done)\b")
-"""What the command says, without a terminal, when an experiment enters a stage."""
+DONE = re.compile(r"\[\d+/\d+, \d+ s\] (?P<name>\S+): \d+ runs in (?P<seconds>[\d.]+) s$")
+"""What the command says when an experiment is done."""
 SKIPPED = re.compile(r"(?P<name>[^\s:]+): skipped\b")
 
 
@@ -30,8 +30,8 @@ def reproduced(
         tell: is given what the command says.
 
     Returns:
-        `wall`, seconds of the whole process; `experiments`, with `compiling`, `running`, `reporting` and `wall` in
-        seconds each (None where the command did not tell); `skipped`, their names.
+        `wall`, seconds of the whole command; `experiments`, with `compiling`, `running`, `rest` and `wall` in seconds
+        each (None where it is not known); `skipped`, their names.
 
     Raises:
         ChildError: the command failed.
@@ -51,7 +51,7 @@ def reproduced(
         wall = time.perf_counter() - started
         if child.returncode:
             raise ChildError(f"emt reproduce ended with code {child.returncode}: {said[-1][1] if said else ''}")
-        experiments = [costs | timing_of(out / costs["name"]) for costs in stages(said)]
+        experiments = [timed(name, seconds, out / name) for name, seconds in done(line for _, line in said)]
     skipped = [found["name"] for _, line in said if (found := SKIPPED.match(line))]
     return {"scale": scale, "wall": wall, "experiments": experiments, "skipped": skipped}
 
@@ -63,33 +63,27 @@ def heard(lines: Iterable[str], started: float, tell: Callable[[str], None]) -> 
         yield time.perf_counter() - started, line.rstrip()
 
 
-def stages(said: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """When experiments entered their stages, as durations: `reporting`, and `wall` since the one before was done."""
-    entered: dict[str, dict[str, float]] = {}
-    for seconds, line in said:
-        if found := STAGE.match(line):
-            entered.setdefault(found["name"], {}).setdefault(found["stage"], seconds)
-    costs, before = [], 0.0
-    for name, times in entered.items():
-        end = times.get("done", before)
-        reporting = end - times["reporting"] if {"reporting", "done"} <= set(times) else None
-        costs.append({"name": name, "reporting": reporting, "wall": end - before})
-        before = end
-    return costs
+def done(lines: Iterable[str]) -> list[tuple[str, float]]:
+    """Experiments that were done, with the seconds each took."""
+    return [(found["name"], float(found["seconds"])) for line in lines if (found := DONE.match(line))]
 
 
-def timing_of(folder: Path) -> dict[str, Any]:
-    """Seconds of compiling and running, and the number of runs, as the run folder has them."""
+def timed(name: str, seconds: float, folder: Path) -> dict[str, Any]:
+    """What an experiment spent its seconds on, as far as its run folder tells; the rest are start, tables and
+    figures."""
     try:
         found = json.loads((folder / TIMING_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         found = {}
-    return {"compiling": found.get("compile_seconds"), "running": found.get("run_seconds"), "runs": found.get("runs")}
+    compiling, running = found.get("compile_seconds"), found.get("run_seconds")
+    rest = None if compiling is None or running is None else max(seconds - compiling - running, 0.0)
+    costs = {"compiling": compiling, "running": running, "rest": rest, "wall": seconds}
+    return {"name": name, "runs": found.get("runs"), **costs}
 
 
 def reproduced_table(results: dict[str, Any]) -> Table:
     """For people."""
-    parts = ("compiling", "running", "reporting", "wall")
+    parts = ("compiling", "running", "rest", "wall")
     columns = [Column("name", "experiment"), Column("runs", "runs", True)]
     columns += [Column(part, f"{part} s", True) for part in parts]
     found = results["experiments"]
@@ -102,7 +96,8 @@ def reproduced_table(results: dict[str, Any]) -> Table:
 
     rows = [*(shown(row["name"], row["runs"], row) for row in found), shown("in all", None, sums)]
     notes = [
-        "An empty compilation cache. The wall time in all is that of the process, start and reports of papers included."
+        "An empty compilation cache. Experiments run side by side: their seconds add up to more than the wall time in "
+        "all, which is that of the whole command."
     ]
     notes += [f"Skipped, without their recordings: {', '.join(results['skipped'])}."] * bool(results["skipped"])
     return Table(f"reproduce, at {results['scale']} scale", columns, rows, [*found, {"name": "in all", **sums}], notes)

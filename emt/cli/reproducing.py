@@ -107,14 +107,16 @@ def finished(jobs: list[Job], at_once: int) -> Iterator[str]:
     Tracing, compiling and drawing keep one processor busy each; experiments do not wait for one another.
     """
     began, count = time.perf_counter(), len(jobs)
-    with ProcessPoolExecutor(min(at_once, max(count, 1)), mp_context=multiprocessing.get_context("spawn")) as pool:
+    at_once = min(at_once, max(count, 1))
+    say(f"{count} experiments, {at_once} at a time; the first ones are compiling, which takes half a minute")
+    with ProcessPoolExecutor(at_once, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             futures = [pool.submit(run_job, job) for job in spread(jobs)]
             for done, future in enumerate(as_completed(futures), start=1):
                 name, text, error = future.result()
                 if error:
                     raise UnusableError(error)
-                say(f"[{done}/{count}, {time.perf_counter() - began:.0f} s] {name}: {text}")
+                say(progress(done, count, time.perf_counter() - began, name, text))
                 yield name
         except KeyboardInterrupt:
             message = "interrupted: finished chunks of runs are kept; the same command continues"
@@ -135,7 +137,12 @@ def run_job(job: Job) -> tuple[str, str, str]:
         summary = run(loaded, job.folder)
     except expected_errors() as error:
         return job.name, "", str(error)
-    return job.name, f"{summary['runs']} runs in {time.perf_counter() - began:.0f} s", ""
+    return job.name, f"{summary['runs']} runs in {time.perf_counter() - began:.1f} s", ""
+
+
+def progress(done: int, count: int, seconds: float, name: str, text: str) -> str:
+    """What is said when an experiment is done; `emt bench reproduce` reads it."""
+    return f"[{done}/{count}, {seconds:.0f} s] {name}: {text}"
 
 
 def find_recordings(loaded, places: list[Path]) -> dict[str, Path]:

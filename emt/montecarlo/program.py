@@ -21,7 +21,7 @@ from emt.types import Articulated, Estimate, Info, Measurements, Point, Prior, S
 
 
 class Simulation(NamedTuple):
-    """Truth and scans, screened, of a chunk of runs; leading axes run, time."""
+    """Truth and scans of a chunk of runs; leading axes run, time."""
 
     truth: Truth
     scans: Measurements

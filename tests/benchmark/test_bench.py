@@ -15,12 +15,12 @@ from emt.benchmark.goals import GOALS, goals_table, verdicts
 from emt.benchmark.operations import COUNTS, mem_ekf_star, moment_ukf, multiple_model, shape_mixture, vb
 from emt.benchmark.peak import measured_peak
 from emt.benchmark.report import markdown, workload_table
-from emt.benchmark.reproducing import reproduced_table, stages
+from emt.benchmark.reproducing import done, reproduced_table, timed
 from emt.benchmark.rivals import BATCHED, NEEDS_CHECKOUT, NEEDS_PEERS, PER_RUN, PLAIN, DisagreementError, Missing
 from emt.benchmark.scaling import one_size, scaling_table
 from emt.benchmark.workloads import WORKLOADS, Bench, load_workload, prepared
-from emt.cli.display import LiveView
-from emt.runner import Progress
+from emt.cli.reproducing import progress
+from emt.reports.paper import TIMING_FILE
 from tests.cli.run_emt import emt
 from tests.montecarlo.small import write
 
@@ -198,22 +198,19 @@ def test_one_size_of_scaling(tmp_path, monkeypatch):
     assert "1.000" in scaling_table([row]).render("text")
 
 
-def test_stages_of_reproduction(capsys):
-    """From what the command says where there is no terminal."""
-    for name in ("a/one", "b/two"):
-        with LiveView(name, "gw") as view:
-            for stage in ("compiling", "running", "reporting", "done"):
-                view.update(Progress(stage, "", 0, 8, 0.0, {}))
-    lines = capsys.readouterr().err.splitlines()
-    lines.insert(4, "c/three: skipped, it needs its recording: --data PATH")
-    found = stages([(float(k), line) for k, line in enumerate(lines)])
-    assert found == [
-        {"name": "a/one", "reporting": 1.0, "wall": 3.0},
-        {"name": "b/two", "reporting": 1.0, "wall": 5.0},
-    ]
-    rows = [row | {"compiling": 2.0, "running": None, "runs": 8} for row in found]
-    table = reproduced_table({"scale": "smoke", "wall": 9.0, "experiments": rows, "skipped": ["c/three"]})
-    assert table.values[-1] == {"name": "in all", "compiling": 4.0, "running": 0.0, "reporting": 2.0, "wall": 9.0}
+def test_costs_of_reproduction(tmp_path):
+    """From what the command says, and from the run folders."""
+    told = {"a/one": "8 runs in 6.5 s", "b/two": "3 runs in 0.5 s"}
+    lines = [progress(k, 2, 10.0 * k, name, text) for k, (name, text) in enumerate(told.items(), start=1)]
+    lines.insert(1, "c/three: skipped, it needs its recording: --data PATH")
+    assert done(lines) == [("a/one", 6.5), ("b/two", 0.5)]
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / TIMING_FILE).write_text('{"compile_seconds": 4.0, "run_seconds": 1.5, "runs": 8}')
+    rows = [timed("a/one", 6.5, tmp_path / "one"), timed("b/two", 0.5, tmp_path / "two")]
+    assert rows[0] == {"name": "a/one", "runs": 8, "compiling": 4.0, "running": 1.5, "rest": 1.0, "wall": 6.5}
+    assert rows[1] == {"name": "b/two", "runs": None, "compiling": None, "running": None, "rest": None, "wall": 0.5}
+    table = reproduced_table({"scale": "smoke", "wall": 5.0, "experiments": rows, "skipped": ["c/three"]})
+    assert table.values[-1] == {"name": "in all", "compiling": 4.0, "running": 1.5, "rest": 1.0, "wall": 5.0}
     assert "c/three" in table.render("text")
 
 

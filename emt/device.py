@@ -38,6 +38,11 @@ def cpu_name() -> str:
     )
 
 
+def processors() -> int:
+    """Processors that this process may use. XLA shares its work among them, and so their number changes rounding."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def environment() -> dict[str, Any]:
     """Versions and device, for the record of a result."""
     import jax
@@ -48,6 +53,7 @@ def environment() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "machine": platform.machine(),
         "cpu": cpu_name(),
+        "processors": processors(),
         "python": platform.python_version(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         **{name: version(name) for name in packages},

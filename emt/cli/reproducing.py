@@ -1,7 +1,6 @@
 """`emt reproduce`: all experiments of the papers, as many at a time as there are processors."""
 
 import multiprocessing
-import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -49,6 +48,7 @@ def reproduce(
     from emt.config.load import load_experiment
     from emt.config.shipped import config_names
     from emt.config.shipped import papers as shipped_papers
+    from emt.device import processors
     from emt.registry import suggest
     from emt.reports.paper import paper_report
 
@@ -87,11 +87,6 @@ def reproduce(
     for name in finished(queue, jobs or processors()):
         missing.discard(name)
         report_complete()
-
-
-def processors() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def spread(jobs: list[Job]) -> list[Job]:

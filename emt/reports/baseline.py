@@ -12,7 +12,7 @@ EXACT_TOLERANCE = 1e-9
 """Largest relative change of a metric on the platform of the baseline."""
 Z_LIMIT = 4.0
 """Largest change in combined standard errors on another platform."""
-PLATFORM = ("device", "backend", "machine", "cpu", "jax", "jaxlib")
+PLATFORM = ("device", "backend", "machine", "cpu", "processors", "jax", "jaxlib")
 """What must be equal for numbers to be equal to rounding."""
 
 

@@ -73,6 +73,14 @@ def _(axis_size, in_batched, number):
     return (number.max(axis=0) if in_batched[0] else number), False
 
 
+def all_of_batch(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether a condition holds for all runs of a batch: what is chosen by it is computed for all of them or for none.
+
+    Choosing between two equal results is all it may be used for: a run must not depend on its company.
+    """
+    return over_batch(jnp.where(condition, 0, 1)) == 0
+
+
 def filled_slots(scan: Measurements) -> Int[Array, ""]:
     """Slots up to the last real point of the fullest scan of a batch: padding at the end costs nothing."""
     slots = jnp.arange(scan.mask.shape[0])

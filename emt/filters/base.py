@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int
 
 from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
 from emt.models.motion import MotionNoise
-from emt.scans import is_seen, scan_statistics, screen
+from emt.scans import all_of_batch, is_seen, scan_statistics, screen
 from emt.status import Status
 from emt.types import Articulated, Ellipse, Estimate, Filter, Info, Measurements, Point, State, Traced
 
@@ -108,15 +108,24 @@ def guarded(flt: Filter) -> Filter:
         state = flt.init(prior, key)
         return Guarded(state, state)
 
+    def soundness(state):
+        return jnp.where(all_finite(state), estimate_status(flt.estimate(state)), int(Status.NON_FINITE))
+
     def predict(guard, dt, key):
         return Guarded(flt.predict(guard.state, dt, key), guard.last)
 
     def update(guard, scan, key):
         scan = screen(scan)
         new, info = flt.update(guard.state, scan, key)
-        new = keep_if(is_seen(scan), new, guard.state)
-        status = jnp.where(all_finite(new), estimate_status(flt.estimate(new)), int(Status.NON_FINITE))
-        state = keep_if(status == 0, new, guard.last)
+        seen, bits = is_seen(scan), soundness(new)
+
+        def settled():
+            kept = keep_if(seen, new, guard.state)
+            found = soundness(kept)
+            return keep_if(found == 0, kept, guard.last), found
+
+        # a batch in which every run saw something and is sound, as nearly all are, has nothing to choose
+        state, status = jax.lax.cond(all_of_batch(seen & (bits == 0)), lambda: (new, jnp.zeros_like(bits)), settled)
         status = status | info.status
         status = status | jnp.where(jnp.asarray(scan.skipped), int(Status.MEASUREMENT_SKIPPED), 0)
         status = status | jnp.where(scan.overflow, int(Status.SCAN_OVERFLOW), 0)

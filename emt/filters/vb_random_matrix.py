@@ -137,8 +137,14 @@ def iterate(prior: VbState, stats: ScanStatistics, model: TrackingModel, q: Fact
     )
 
 
-def update(state: VbState, scan: Measurements, model: TrackingModel, iterations: int) -> VbState:
-    """Measurement update by `iterations` fixed-point iterations (Tuncer and Özkan 2021, Sec. III)."""
+def update(
+    state: VbState, scan: Measurements, model: TrackingModel, iterations: int, turn: Turn | None = None
+) -> VbState:
+    """Measurement update by `iterations` fixed-point iterations (Tuncer and Özkan 2021, Sec. III).
+
+    Args:
+        turn: of the predicted orientation, if it is known already.
+    """
     stats = scan_statistics(scan)
     zero = jnp.zeros_like(stats.count)
     start = Factors(
@@ -156,7 +162,7 @@ def update(state: VbState, scan: Measurements, model: TrackingModel, iterations:
             zero,
             model.extent_scale * state.scale.y / (state.shape.y - 1.0),
         ),
-        turn=Turn.of(state.orientation, state.orientation_var),
+        turn=Turn.of(state.orientation, state.orientation_var) if turn is None else turn,
     )
     q = jax.lax.fori_loop(0, iterations, lambda _, q: iterate(state, stats, model, q), start)
     belief = kinematics.with_position(state.kinematics, q.position, q.position_cov)
@@ -205,12 +211,13 @@ def vb_random_matrix(iterations: int, params: Params, model: TrackingModel) -> F
 
     def update_step(state, scan, key):
         axes = semi_axes(state)
-        extent = Sym2.ellipse(axes.x, axes.y, state.orientation)
+        turn = Turn.of(state.orientation, state.orientation_var)
+        extent = rotated_diagonal(axes.x * axes.x, axes.y * axes.y, turn.cos2, turn.sin2)
         spread = model.extent_scale * extent + model.sensor_noise
         info = innovation_info(state.kinematics.position, state.kinematics.position_cov, spread, scan)
         floored = (state.shape.x <= MIN_SHAPE) | (state.shape.y <= MIN_SHAPE)
         status = info.status | jnp.where(floored, int(Status.FLOOR_USED), 0)
-        return update(state, scan, model, iterations), info._replace(status=status)
+        return update(state, scan, model, iterations, turn), info._replace(status=status)
 
     return Filter(init, lambda state, dt, key: predict(state, dt, model, params), update_step, estimate)
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from emt.filters.base import keep_if
 from emt.keys import start_key, step_key
+from emt.linalg import once
 from emt.metrics.base import Ending, Metric, has
 from emt.metrics.iou import iou
 from emt.metrics.kinematic import position_error_squared
@@ -56,12 +57,16 @@ class Tracker(NamedTuple):
 def advance(
     tracker: Tracker, state: State, k: Int[Array, ""], scan: Measurements, dt: Scalar, key: PRNGKeyArray
 ) -> tuple[State, Info]:
-    """One step: prediction (not before the first scan, unless asked for) and update."""
+    """One step: prediction (not before the first scan, unless asked for) and update.
+
+    Its halves and its result are computed once each, whatever enters them (see `linalg.once`).
+    """
     predict_key, update_key = jax.random.split(step_key(key, k))
     predicted = tracker.flt.predict(state, dt, predict_key)
     if not tracker.predict_first:
         predicted = keep_if(k > 0, predicted, state)
-    return tracker.flt.update(predicted, scan, update_key)
+    state, info = tracker.flt.update(once(predicted, dt), scan, update_key)
+    return state, once(info, dt)
 
 
 def report(estimate: Estimate, info: Info, status: Int[Array, ""], full: bool) -> Track:

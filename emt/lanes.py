@@ -13,7 +13,7 @@ PerRun = Float[Array, "*lanes"]
 """A number of a run: of shape () where a step of one run is written down, of many runs where it is mapped."""
 
 
-def lanes_last(function: Mapped) -> Mapped:
+def lanes_last(function: Mapped, levels: int = 2) -> Mapped:
     """The function, which `vmap` maps by an axis behind those of its arrays instead of one before them.
 
     A matrix (n, n) of each run becomes (n, n, runs), in memory n² vectors over runs, which processors add and multiply
@@ -21,8 +21,12 @@ def lanes_last(function: Mapped) -> Mapped:
 
     The function must take and return arrays with any axes behind their own, and compute along them: sums and products
     name their axes from the front, and a number that belongs to a run has the shape of what comes behind; a number that
-    all runs share stays one.
+    all runs share stays one. Derivatives are those of `jax.jvp`, one direction at a time; not of maps over it.
+
+    Args:
+        levels: nested maps that go behind, the outermost last; those around them map as usual.
     """
+    within = lanes_last(function, levels - 1) if levels > 1 else function
 
     @jax.custom_batching.custom_vmap
     def mapped(*arguments):
@@ -36,7 +40,7 @@ def lanes_last(function: Mapped) -> Mapped:
             return jnp.broadcast_to(leaf[..., None], (*leaf.shape, axis_size)) if jnp.ndim(leaf) else leaf
 
         moved = jax.tree.map(inwards, arguments, tuple(in_batched))
-        out = function(*moved)
+        out = within(*moved)
 
         def outwards(leaf):
             wide = jnp.broadcast_to(leaf, (*leaf.shape[:-1], axis_size))

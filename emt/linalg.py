@@ -333,8 +333,12 @@ def semidefinite_root(matrix):
 
 
 def forward_solve(root, right):
-    """root⁻¹ right for a lower triangular root (n, n), right (n,) or (n, k), row by row in plain operations."""
-    rows = []
+    """root⁻¹ right for a lower triangular root (n, n), right (n,) or (n, k), row by row in plain operations.
+
+    Or for many, along axes behind those of both.
+    """
+    n, *lanes = root.shape[1:]
+    root, rows = root.reshape(n, n, *(1,) * (right.ndim - 1 - len(lanes)), *lanes), []
     for i in range(root.shape[0]):
         rest = right[i]
         for j in range(i):

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from emt.linalg import cholesky, forward_solve
+from emt.lanes import lanes_last, total
+from emt.linalg import cholesky, forward_solve, once
 from emt.models.state_space.measurements import Measurement
 from emt.models.state_space.motions import Motion
 from emt.types import Scalar
@@ -52,15 +53,28 @@ class Kernel(NamedTuple):
 def predicted(belief: Belief, motion: Motion, noise_cov: Float[Array, "n n"], time: Scalar, dt: Scalar) -> Belief:
     """Kalman prediction to `time`, `dt` seconds later: exact for a linear motion, else linearised at the mean.
 
-    Source: Azimian 2005, eq. 2.3; F P Fᵀ + Q in this order is symmetric but for rounding, so it is made so.
+    Source: Azimian 2005, eq. 2.3.
     """
     mean, jacobian = motion.linearised(belief.mean, time, dt)
-    return Belief(mean, symmetric(jacobian @ belief.cov @ jacobian.T + noise_cov))
+    return Belief(mean, _propagated(belief.cov, jacobian, noise_cov, dt))
 
 
-def symmetric(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """(M + Mᵀ) / 2."""
-    return 0.5 * (matrix + matrix.T)
+@lanes_last
+def _propagated(cov, jacobian, noise_cov, known):
+    """F P Fᵀ + Q; the product is symmetric but for rounding, so it is made so."""
+    half = once(product(jacobian, cov), known)
+    full = once(product(half, jacobian.swapaxes(0, 1)), known)
+    return once(symmetric(full) + noise_cov, known)
+
+
+def product(left, right):
+    """Product of two small matrices, whatever axes are behind theirs."""
+    return total(left.swapaxes(0, 1)[:, :, None] * right[:, None])
+
+
+def symmetric(matrix):
+    """(M + Mᵀ) / 2, whatever axes are behind its own."""
+    return 0.5 * (matrix + matrix.swapaxes(0, 1))
 
 
 def updated(
@@ -71,15 +85,23 @@ def updated(
     Source: Azimian 2005, eq. 2.3.
     """
     expected, jacobian = measurement.linearised(belief.mean, time)
-    cross = belief.cov @ jacobian.T
-    return conditioned(belief, cross, jacobian @ cross + noise_cov, measurement.difference(value, expected))
+    return _updated(belief, jacobian, noise_cov, measurement.difference(value, expected), time)
 
 
+@lanes_last
+def _updated(belief: Belief, jacobian, noise_cov, innovation, known) -> tuple[Belief, Innovation]:
+    belief, innovation = once((belief, innovation), known)
+    cross = once(product(belief.cov, jacobian.swapaxes(0, 1)), known)
+    innovation_cov = once(product(jacobian, cross) + noise_cov, known)
+    return once(conditioned(belief, cross, innovation_cov, innovation), known)
+
+
+@lanes_last
 def conditioned(
     belief: Belief,
-    cross: Float[Array, "n m"],
-    innovation_cov: Float[Array, "m m"],
-    innovation: Float[Array, "m"],
+    cross: Float[Array, "n m *lanes"],
+    innovation_cov: Float[Array, "m m *lanes"],
+    innovation: Float[Array, "m *lanes"],
 ) -> tuple[Belief, Innovation]:
     """The belief given an innovation ν of covariance S = L Lᵀ whose cross-covariance with the state is C.
 
@@ -87,12 +109,13 @@ def conditioned(
     keeps digits while P / R stays below about 1e13. A square-root update by QR, as JAX libraries have it, has no such
     bound and takes ten times as long in batches of four states.
     """
-    root = cholesky(innovation_cov)
-    gain, white = forward_solve(root, cross.T), forward_solve(root, innovation)
-    nis = (white * white).sum()
-    log_likelihood = -0.5 * (nis + len(innovation) * math.log(2.0 * math.pi)) - jnp.log(jnp.diagonal(root)).sum()
-    taken = (gain[:, :, None] * gain[:, None, :]).sum(axis=0)
-    return Belief(belief.mean + gain.T @ white, belief.cov - taken), Innovation(log_likelihood, nis)
+    m, root = innovation.shape[0], cholesky(innovation_cov)
+    gain, white = forward_solve(root, cross.swapaxes(0, 1)), forward_solve(root, innovation)
+    nis = total(white * white)
+    volume = math.prod(root[i, i] for i in range(m))
+    log_likelihood = -0.5 * (nis + m * math.log(2.0 * math.pi)) - jnp.log(volume)
+    mean, taken = belief.mean + total(gain * white[:, None]), total(gain[:, :, None] * gain[:, None, :])
+    return Belief(mean, belief.cov - taken), Innovation(log_likelihood, nis)
 
 
 def mixed(weights: Float[Array, "n_from n_to"], beliefs: Belief) -> Belief:

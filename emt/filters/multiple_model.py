@@ -79,7 +79,7 @@ def bank_predicted(model: StateSpaceModel, beliefs: Belief, time: Scalar, dt: Sc
     """Each belief (leading axis) predicted by its own motion."""
     groups, parts = grouped(model.motions), []
     for group in groups:
-        mine = jax.tree.map(lambda leaf, places=group.places: leaf[jnp.asarray(places)], beliefs)
+        mine = group.own(beliefs)
         parts.append(
             jax.vmap(lambda motion, b: predicted(b, motion, motion.noise_cov(dt), time, dt))(group.motion, mine)
         )

@@ -187,6 +187,12 @@ class Alike(NamedTuple):
     """Of its parts among all motions."""
     motion: Motion
 
+    def own(self, everything: Any) -> Any:
+        """Its parts of what has a leading axis over all motions."""
+        if self.places == tuple(range(len(jax.tree.leaves(everything)[0]))):
+            return everything
+        return jax.tree.map(lambda leaf: leaf[jnp.asarray(self.places)], everything)
+
 
 def grouped(motions: Sequence[Motion]) -> list[Alike]:
     """Motions in groups that can be computed together, each once instead of once per motion."""

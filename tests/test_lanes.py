@@ -47,6 +47,23 @@ def test_arguments_that_runs_share_are_shared():
     np.testing.assert_allclose(one.mean, plain.mean[2], rtol=1e-12)
 
 
+@pytest.mark.parametrize("levels", [1, 2])
+def test_maps_within_maps(levels):
+    """Modes within runs within experiments: what is not put behind is mapped as usual."""
+    covs = jnp.stack([jnp.stack([covariances() for _ in range(3)]) for _ in range(2)])
+    shifts = jnp.asarray(RNG.normal(size=(2, RUNS, N)))
+
+    def step(cov, shift):
+        return product(square_root(cov)) + shift[:, None] * shift[None, :], total(shift)
+
+    def nested(function):
+        within = jax.vmap(jax.vmap(function), in_axes=(0, None))  # shifts are shared by the middle axis
+        return jax.jit(jax.vmap(within))(covs, shifts)
+
+    for ours, theirs in zip(nested(lanes_last(step, levels)), nested(step), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
+
+
 def test_forward_derivatives_pass_through():
     """As `emt tune` takes them, of one run and of many."""
     cov = covariances()

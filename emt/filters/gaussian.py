@@ -61,7 +61,7 @@ def predicted(belief: Belief, motion: Motion, noise_cov: Float[Array, "n n"], ti
 
 @lanes_last
 def _propagated(cov, jacobian, noise_cov, known):
-    """F P Fᵀ + Q; the product is symmetric but for rounding, so it is made so."""
+    """F P Fᵀ + Q; the product is symmetric but for rounding, so it is made so. For `known` see `linalg.once`."""
     half = once(product(jacobian, cov), known)
     full = once(product(half, jacobian.swapaxes(0, 1)), known)
     return once(symmetric(full) + noise_cov, known)
@@ -90,6 +90,7 @@ def updated(
 
 @lanes_last
 def _updated(belief: Belief, jacobian, noise_cov, innovation, known) -> tuple[Belief, Innovation]:
+    """`conditioned` with C = P Hᵀ and S = H C + R, each computed once; for `known` see `linalg.once`."""
     belief, innovation = once((belief, innovation), known)
     cross = once(product(belief.cov, jacobian.swapaxes(0, 1)), known)
     innovation_cov = once(product(jacobian, cross) + noise_cov, known)
@@ -112,8 +113,8 @@ def conditioned(
     m, root = innovation.shape[0], cholesky(innovation_cov)
     gain, white = forward_solve(root, cross.swapaxes(0, 1)), forward_solve(root, innovation)
     nis = total(white * white)
-    volume = math.prod(root[i, i] for i in range(m))
-    log_likelihood = -0.5 * (nis + m * math.log(2.0 * math.pi)) - jnp.log(volume)
+    log_volume = sum(jnp.log(root[i, i]) for i in range(m))
+    log_likelihood = -0.5 * (nis + m * math.log(2.0 * math.pi)) - log_volume
     mean, taken = belief.mean + total(gain * white[:, None]), total(gain[:, :, None] * gain[:, None, :])
     return Belief(mean, belief.cov - taken), Innovation(log_likelihood, nis)
 

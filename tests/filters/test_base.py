@@ -137,6 +137,35 @@ def test_guard_ignores_updates_without_a_point(scan):
     assert_equal(flt.update(start, scan, KEY)[0].state, start.state)
 
 
+def test_company_changes_nothing_behind_the_guard():
+    """Sound, unsound and blind runs in one batch, and batches in which all are sound: as each of them alone."""
+    flt = guarded(
+        Filter(
+            lambda prior, key: estimate_of(mean=prior.mean),
+            lambda state, dt, key: state._replace(mean=state.mean + dt),
+            lambda state, scan, key: (
+                state._replace(mean=scan.points[0, 0] * state.mean),
+                Info(jnp.asarray(-1.0), jnp.asarray(2.0), jnp.asarray(0)),
+            ),
+            lambda state: state,
+        )
+    )
+
+    def one(x, mask):
+        scan = scan_of([[0.0, 0.0]])._replace(points=jnp.stack([x, x])[None], mask=mask[None])
+        start = flt.predict(flt.init(PRIOR, KEY), jnp.asarray(1.0), KEY)
+        return flt.update(start._replace(state=start.state._replace(cov=x * start.state.cov)), scan, KEY)
+
+    x, mask = jnp.asarray([1.0, -1.0, 2.0, 3.0, 3.0]), jnp.asarray([True, True, False, True, True])
+    for some in (slice(None), slice(3, None)):
+        together = jax.vmap(one)(x[some], mask[some])
+        for k, (mine, seen) in enumerate(zip(x[some], mask[some], strict=True)):
+            assert_equal(jax.tree.map(lambda leaf, k=k: leaf[k], together), one(mine, seen))
+    state, info = jax.vmap(one)(x, mask)
+    assert info.status.tolist() == [0, int(Status.NOT_POSITIVE_DEFINITE), 0, 0, 0]
+    np.testing.assert_array_equal(state.state.mean[:3], [PRIOR.mean + 1.0, PRIOR.mean, PRIOR.mean + 1.0])
+
+
 @pytest.mark.parametrize(("log_likelihood", "nis"), [(-np.inf, 1.0), (0.0, np.inf), (np.nan, np.nan)])
 def test_diagnostics_are_finite_or_flagged(log_likelihood, nis):
     bad = Info(jnp.asarray(log_likelihood), jnp.asarray(nis), jnp.asarray(int(Status.GROSS_INNOVATION)))

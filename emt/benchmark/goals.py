@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from emt.benchmark.rivals import BATCHED, PLAIN
-from emt.benchmark.workloads import WORKLOADS
+from emt.benchmark.standard import WORKLOADS
 from emt.reports.numbers import significant
 from emt.reports.table import Column, Table
 

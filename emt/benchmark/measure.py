@@ -9,7 +9,8 @@ from typing import Any
 from emt.benchmark.clock import Cost, interleaved
 from emt.benchmark.compiling import compile_costs
 from emt.benchmark.rivals import Agreement, Rival, agreement, rivals_of
-from emt.benchmark.workloads import WORKLOADS, Bench, prepared
+from emt.benchmark.standard import WORKLOADS
+from emt.benchmark.workloads import Bench, prepared
 
 Tell = Callable[[str], None]
 """Called with a word on what is going on."""

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from emt.benchmark.clock import interleaved, timed
 from emt.benchmark.processes import peak_memory
-from emt.benchmark.workloads import options_of
 from emt.config.load import Loaded, load_experiment
 from emt.config.shipped import config_names, papers
 from emt.montecarlo.chunks import Engine
@@ -65,16 +64,16 @@ def timed_parts(program: Program, loaded: Loaded) -> tuple[dict[str, Callable[[]
     seed = jnp.asarray(loaded.experiment.monte_carlo.seed)
     runs = jnp.arange(loaded.experiment.chunk_size)
     bare = dataclasses.replace(program, metrics=())
-    options = options_of(Engine(program, loaded.experiment.monte_carlo.seed, loaded.experiment.chunk_size))
+    engine = Engine(program, loaded.experiment.monte_carlo.seed, loaded.experiment.chunk_size)
     compile_seconds, calls = {}, {}
 
-    def add(part, function, arguments):
+    def add(part, function, arguments, options=engine.options):
         lowered: list[Any] = []
         _, compile_seconds[part] = timed(lambda: lowered.append(function.lower(*arguments).compile(options)))
         calls[part] = lambda: jax.block_until_ready(lowered[0](*arguments))
         return calls[part]()
 
-    simulation = add("simulation", program.simulator(), (program.world, seed, runs))
+    simulation = add("simulation", program.simulator(), (program.world, seed, runs), engine.simulator_options)
     for label in loaded.experiment.filters:
         arguments = (program.world, program.filter_params[label], seed, runs, simulation.scans, simulation.truth)
         add(f"{label}, filter only", bare.scorer(label), arguments)

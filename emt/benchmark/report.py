@@ -101,7 +101,7 @@ def summary_table(results: Mapping[str, Any]) -> Table:
 def method_of(results: Mapping[str, Any]) -> list[str]:
     """How it was measured, in three lines."""
     core, peak = results["core"], results["peak"]
-    place = "unbound" if core is None else f"bound to core {core}"
+    place = "unbound" if core is None else f"bound to core {core} before JAX is loaded"
     kernel = ""
     if peak is not None:
         kernel = (

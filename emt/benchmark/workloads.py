@@ -1,4 +1,4 @@
-"""The standard workloads: their names and sizes, and the parts of each that are timed."""
+"""The parts of a standard workload that are timed."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -12,28 +12,11 @@ from emt.benchmark.operations import COUNTS
 from emt.benchmark.peers.agreement import own_reports
 from emt.benchmark.peers.base import ELLIPSE, Scans
 from emt.benchmark.peers.given import scans_of
+from emt.benchmark.standard import WORKLOADS
 from emt.config.load import Loaded, load_experiment
 from emt.montecarlo.chunks import Engine
 from emt.montecarlo.program import Program
 from emt.runner import build_program
-
-
-class Workload(NamedTuple):
-    """A standard workload, `benchmark/NAME` among the shipped experiments; a chunk of its runs is timed."""
-
-    number: str
-    few: int
-    """Runs given to what takes one run after the other."""
-
-
-WORKLOADS = {
-    "vb": Workload("W1", 4),
-    "mem_ekf_star": Workload("W2", 4),
-    "moment_ukf": Workload("W3", 2),
-    "shape_mixture": Workload("W4", 2),
-    "multiple_model": Workload("W5", 4),
-    "particle": Workload("W6", 8),
-}
 
 
 class Bench(NamedTuple):
@@ -88,11 +71,6 @@ def load_workload(name: str, overrides: Sequence[str] = ()) -> Loaded:
     return load_experiment(f"benchmark/{name}", overrides)
 
 
-def options_of(engine: Engine) -> dict[str, Any] | None:
-    """What an engine tells the compiler: parts that are timed alone have to be compiled like the whole."""
-    return engine.options
-
-
 def compiled_filter(
     program: Program, label: str, seed: jax.Array, runs: jax.Array, simulation, options: dict[str, Any] | None
 ) -> Callable[[], Any]:
@@ -116,11 +94,11 @@ def prepared(name: str, overrides: Sequence[str] = ()) -> Bench:
     engine = Engine(program, seed, n)
     engine.compile()
     arguments = (program.world, jnp.asarray(seed), jnp.arange(n))
-    simulator = program.simulator().lower(*arguments).compile(options_of(engine))
+    simulator = program.simulator().lower(*arguments).compile(engine.simulator_options)
     simulation = jax.block_until_ready(simulator(*arguments))
     calls = {
         "simulation": lambda: jax.block_until_ready(simulator(*arguments)),
-        "filter": compiled_filter(program, label, *arguments[1:], simulation, options_of(engine)),
+        "filter": compiled_filter(program, label, *arguments[1:], simulation, engine.options),
         "end_to_end": lambda: engine.run_chunk(0, n),
     }
     arrays = engine.run_chunk(0, n, tracked=n)

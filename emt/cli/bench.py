@@ -62,7 +62,7 @@ def sorted_out(names: list[str]) -> tuple[list[str], list[str], list[str]]:
     Raises:
         UnusableError: a name is none of them.
     """
-    from emt.benchmark.workloads import WORKLOADS
+    from emt.benchmark.standard import WORKLOADS
     from emt.config.shipped import config_names, papers
     from emt.registry import suggest
 
@@ -75,7 +75,13 @@ def sorted_out(names: list[str]) -> tuple[list[str], list[str], list[str]]:
         raise UnusableError(f"unknown workload '{name}'{hint}; known: {', '.join(known)}, experiments and papers")
     names = list(dict.fromkeys(names))
     standard: list[str] = [name for name in WORKLOADS if not names or name in names]
-    return standard, [name for name in WHOLE if name in names], [name for name in names if name not in known]
+    experiments = [name for name in names if name not in known]
+    if standard and experiments:
+        raise UnusableError(
+            f"'{experiments[0]}' is timed on all processors and the workload '{standard[0]}' on one: "
+            "give them to two commands"
+        )
+    return standard, [name for name in WHOLE if name in names], experiments
 
 
 def is_file_name(name: str) -> bool:
@@ -122,25 +128,29 @@ def check_place(option: str, place: Path | None) -> None:
 
 def measure_workloads(found: dict[str, Any], names: list[str], repetitions: int, peers: bool) -> dict[str, Any]:
     """Measures the standard workloads into `found`, shows each, and returns what is known of all."""
-    from emt.benchmark import measure, peak, processes, report
     from emt.benchmark.clock import one_core
-    from emt.benchmark.rivals import DisagreementError
 
     if not names:
-        return measure.circumstances(repetitions, None, None) | {"help_seconds": None}
-    try:
-        with one_core() as core:
+        from emt.benchmark.measure import circumstances
+
+        return circumstances(repetitions, None, None) | {"help_seconds": None}
+    # before JAX is loaded, which would share small loops among all the processors that it finds
+    with one_core() as core:
+        from emt.benchmark import measure, peak, processes, report
+        from emt.benchmark.rivals import DisagreementError
+
+        try:
             fastest = peak.measured_peak()
             for name in names:
                 options = {"repetitions": repetitions, "peers": peers, "peak": fastest.flops, "tell": say}
                 found[name] = measure.measure(name, **options)
                 typer.echo(report.workload_table(found[name]).render("text"))
-        help_seconds = processes.help_seconds()
-    except DisagreementError as error:
-        say(str(error))
-        raise typer.Exit(CHECK_FAILED) from error
-    except processes.ChildError as error:
-        raise UnusableError(str(error)) from error
+            help_seconds = processes.help_seconds()
+        except DisagreementError as error:
+            say(str(error))
+            raise typer.Exit(CHECK_FAILED) from error
+        except processes.ChildError as error:
+            raise UnusableError(str(error)) from error
     return measure.circumstances(repetitions, core, fastest) | {"help_seconds": help_seconds}
 
 

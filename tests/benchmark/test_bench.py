@@ -18,7 +18,8 @@ from emt.benchmark.report import markdown, workload_table
 from emt.benchmark.reproducing import done, reproduced_table, timed
 from emt.benchmark.rivals import BATCHED, NEEDS_CHECKOUT, NEEDS_PEERS, PER_RUN, PLAIN, DisagreementError, Missing
 from emt.benchmark.scaling import one_size, scaling_table
-from emt.benchmark.workloads import WORKLOADS, Bench, load_workload, prepared
+from emt.benchmark.standard import WORKLOADS
+from emt.benchmark.workloads import Bench, load_workload, prepared
 from emt.cli.reproducing import progress
 from emt.reports.paper import TIMING_FILE
 from tests.cli.run_emt import emt
@@ -260,6 +261,7 @@ def test_any_experiment_part_by_part(tmp_path, capsys):
         (["vb", "--json", "."], "--json .: cannot be written"),
         (["scaling", "--runs", "10,x"], "--runs 10,x: expected numbers of runs"),
         (["vb", "--repetitions", "0"], "--repetitions"),
+        (["vb", "yao2020/car"], "give them to two commands"),
     ],
 )
 def test_refusals_come_before_any_measurement(arguments, message, capsys, tmp_path, monkeypatch):

@@ -105,7 +105,7 @@ def method_of(results: Mapping[str, Any]) -> list[str]:
     kernel = ""
     if peak is not None:
         kernel = (
-            f" The peak, {peak['flops'] / 1e9:.1f} Gflop/s, is that of multiply-adds on {peak['vectors']} vectors of "
+            f" The peak, {peak['flops'] / 1e9:.1f} Gflop/s, is that of multiply-adds on {peak['vectors']} × "
             f"{peak['length']} doubles in a kernel of XLA's own, measured in the same run."
         )
     return [

@@ -13,7 +13,7 @@ PerRun = Float[Array, "*lanes"]
 """A number of a run: of shape () where a step of one run is written down, of many runs where it is mapped."""
 
 
-def lanes_last(function: Mapped, levels: int = 2) -> Mapped:
+def lanes_last(function: Mapped) -> Mapped:
     """The function, which `vmap` maps by an axis behind those of its arrays instead of one before them.
 
     A matrix (n, n) of each run becomes (n, n, runs), in memory n² vectors over runs, which processors add and multiply
@@ -21,12 +21,8 @@ def lanes_last(function: Mapped, levels: int = 2) -> Mapped:
 
     The function must take and return arrays with any axes behind their own, and compute along them: sums and products
     name their axes from the front, and a number that belongs to a run has the shape of what comes behind; a number that
-    all runs share stays one. Derivatives are those of `jax.jvp`, one direction at a time; not of maps over it.
-
-    Args:
-        levels: nested maps that go behind, the outermost last; those around them map as usual.
+    all runs share stays one. Derivatives are taken forwards (`jax.jvp`, `jax.jacfwd`), not backwards.
     """
-    within = lanes_last(function, levels - 1) if levels > 1 else function
 
     @jax.custom_batching.custom_vmap
     def mapped(*arguments):
@@ -34,13 +30,17 @@ def lanes_last(function: Mapped, levels: int = 2) -> Mapped:
 
     @mapped.def_vmap
     def _(axis_size, in_batched, *arguments):
+        if not any(jax.tree.leaves(in_batched)):  # derivatives along several directions at one place
+            out = function(*arguments)
+            return out, jax.tree.map(lambda _: False, out)
+
         def inwards(leaf, batched):
             if batched:
                 return jnp.moveaxis(leaf, 0, -1)
             return jnp.broadcast_to(leaf[..., None], (*leaf.shape, axis_size)) if jnp.ndim(leaf) else leaf
 
         moved = jax.tree.map(inwards, arguments, tuple(in_batched))
-        out = within(*moved)
+        out = function(*moved)
 
         def outwards(leaf):
             wide = jnp.broadcast_to(leaf, (*leaf.shape[:-1], axis_size))
@@ -49,6 +49,20 @@ def lanes_last(function: Mapped, levels: int = 2) -> Mapped:
         return jax.tree.map(outwards, out), jax.tree.map(lambda _: True, out)
 
     return cast(Mapped, wraps(function)(mapped))
+
+
+def each(function: Mapped) -> Mapped:
+    """The function mapped over the leading axis of its arrays, which is put behind those that `function` knows of.
+
+    For one of `lanes_last` that takes modes or particles of a run: `vmap` then puts the runs behind these. A number
+    without axes is shared.
+    """
+
+    def mapped(*arguments):
+        moved = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1) if jnp.ndim(leaf) else leaf, arguments)
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), function(*moved))
+
+    return cast(Mapped, mapped)
 
 
 def total(array):

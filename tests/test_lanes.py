@@ -7,7 +7,7 @@ import pytest
 
 from emt.filters.moment_ukf import MomentUkfSettings
 from emt.filters.unscented import Gaussian, merge_gaussians, product, square_root
-from emt.lanes import lanes_last, total
+from emt.lanes import each, lanes_last, total
 from emt.linalg import once
 from emt.scans import as_scan, filled_slots, is_seen, prepared, scan_statistics, screen
 from tests.filters.cases import FAST_COMPILE
@@ -47,21 +47,22 @@ def test_arguments_that_runs_share_are_shared():
     np.testing.assert_allclose(one.mean, plain.mean[2], rtol=1e-12)
 
 
-@pytest.mark.parametrize("levels", [1, 2])
-def test_maps_within_maps(levels):
-    """Modes within runs within experiments: what is not put behind is mapped as usual."""
-    covs = jnp.stack([jnp.stack([covariances() for _ in range(3)]) for _ in range(2)])
-    shifts = jnp.asarray(RNG.normal(size=(2, RUNS, N)))
+def shifted(cov, shift):
+    return product(square_root(cov)) + shift[:, None] * shift[None, :], total(shift)
 
-    def step(cov, shift):
-        return product(square_root(cov)) + shift[:, None] * shift[None, :], total(shift)
+
+def test_maps_within_maps():
+    """Modes within runs within experiments."""
+    covs = jnp.stack([jnp.stack([covariances() for _ in range(3)]) for _ in range(2)])
+    shifts = jnp.asarray(RNG.normal(size=(2, 3, RUNS, N)))
 
     def nested(function):
-        within = jax.vmap(jax.vmap(function), in_axes=(0, None))  # shifts are shared by the middle axis
-        return jax.jit(jax.vmap(within))(covs, shifts)
+        return jax.jit(jax.vmap(jax.vmap(function)))(covs, shifts)
 
-    for ours, theirs in zip(nested(lanes_last(step, levels)), nested(step), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
+    plain = nested(jax.vmap(shifted))
+    for function in (each(lanes_last(shifted)), jax.vmap(lanes_last(shifted))):
+        for ours, theirs in zip(nested(function), plain, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-13)
 
 
 def test_forward_derivatives_pass_through():
@@ -70,6 +71,42 @@ def test_forward_derivatives_pass_through():
     direct = jax.vmap(lambda c: jax.jvp(square_root, (c,), (jnp.eye(N),))[1])(cov)
     mapped = jax.jvp(jax.vmap(lanes_last(square_root)), (cov,), (jnp.broadcast_to(jnp.eye(N), cov.shape),))[1]
     np.testing.assert_allclose(mapped, direct, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("runs", [False, True])
+def test_jacobians_where_only_tangents_are_mapped(runs):
+    """Through a loop whose carry depends on what is differentiated, beside an argument that does not."""
+    start, other = covariances(), jnp.asarray(RNG.normal(size=(N, N)))
+
+    def step(cov, matrix):
+        return 0.1 * (cov.swapaxes(0, 1) * matrix + cov)
+
+    def jacobian(function):
+        def end(x):
+            def one(cov):
+                return jax.lax.scan(lambda c, _: (function(c * x[0] + x[1], other), None), cov, None, length=3)[0]
+
+            return jax.vmap(one)(start) if runs else one(start[0])
+
+        return jax.jit(jax.jacfwd(end))(jnp.asarray([1.0, 2.0, 3.0]))
+
+    np.testing.assert_allclose(jacobian(lanes_last(step)), jacobian(step), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("modes", [False, True])
+def test_forward_derivatives_along_many_directions_at_once(modes):
+    """As `emt tune` takes them with several parameters, of runs and of modes within runs."""
+    last = lanes_last(square_root)
+    inner = each(last) if modes else last
+    cov = jnp.stack([covariances() for _ in range(3)], axis=1) if modes else covariances()
+    plain = jax.vmap(square_root) if modes else square_root
+    moves = jnp.asarray(RNG.normal(size=(2, *cov.shape)))
+    moves = moves + moves.swapaxes(-1, -2)
+
+    def along(function):
+        return jax.jit(jax.vmap(lambda move: jax.jvp(jax.vmap(function), (cov,), (move,))[1]))(moves)
+
+    np.testing.assert_allclose(along(inner), along(plain), rtol=1e-10, atol=1e-12)
 
 
 def test_the_sum_is_the_sum():

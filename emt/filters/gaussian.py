@@ -56,11 +56,11 @@ def predicted(belief: Belief, motion: Motion, noise_cov: Float[Array, "n n"], ti
     Source: Azimian 2005, eq. 2.3.
     """
     mean, jacobian = motion.linearised(belief.mean, time, dt)
-    return Belief(mean, _propagated(belief.cov, jacobian, noise_cov, dt))
+    return Belief(mean, propagated(belief.cov, jacobian, noise_cov, dt))
 
 
 @lanes_last
-def _propagated(cov, jacobian, noise_cov, known):
+def propagated(cov, jacobian, noise_cov, known):
     """F P Fᵀ + Q; the product is symmetric but for rounding, so it is made so. For `known` see `linalg.once`."""
     half = once(product(jacobian, cov), known)
     full = once(product(half, jacobian.swapaxes(0, 1)), known)
@@ -85,11 +85,11 @@ def updated(
     Source: Azimian 2005, eq. 2.3.
     """
     expected, jacobian = measurement.linearised(belief.mean, time)
-    return _updated(belief, jacobian, noise_cov, measurement.difference(value, expected), time)
+    return linearly_updated(belief, jacobian, noise_cov, measurement.difference(value, expected), time)
 
 
 @lanes_last
-def _updated(belief: Belief, jacobian, noise_cov, innovation, known) -> tuple[Belief, Innovation]:
+def linearly_updated(belief: Belief, jacobian, noise_cov, innovation, known) -> tuple[Belief, Innovation]:
     """`conditioned` with C = P Hᵀ and S = H C + R, each computed once; for `known` see `linalg.once`."""
     belief, innovation = once((belief, innovation), known)
     cross = once(product(belief.cov, jacobian.swapaxes(0, 1)), known)

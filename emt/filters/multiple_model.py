@@ -9,9 +9,10 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Float
 from pydantic import Field
 
-from emt.filters.gaussian import Belief, Innovation, fused, mixed, predicted, updated
+from emt.filters.gaussian import Belief, Innovation, fused, linearly_updated, mixed, propagated
 from emt.filters.mixing import mixing, posterior
 from emt.filters.state_space import info_of, reading, report
+from emt.lanes import each
 from emt.models.state_space.model import StateSpaceModel
 from emt.models.state_space.motions import grouped, in_order
 from emt.registry import FILTERS, UnknownName, suggest
@@ -80,9 +81,9 @@ def bank_predicted(model: StateSpaceModel, beliefs: Belief, time: Scalar, dt: Sc
     groups, parts = grouped(model.motions), []
     for group in groups:
         mine = group.own(beliefs)
-        parts.append(
-            jax.vmap(lambda motion, b: predicted(b, motion, motion.noise_cov(dt), time, dt))(group.motion, mine)
-        )
+        means, jacobians = jax.vmap(lambda motion, x: motion.linearised(x, time, dt))(group.motion, mine.mean)
+        noise_covs = jax.vmap(lambda motion: motion.noise_cov(dt))(group.motion)
+        parts.append(Belief(means, each(propagated)(mine.cov, jacobians, noise_covs, dt)))
     return in_order(groups, parts)
 
 
@@ -90,8 +91,12 @@ def bank_updated(
     model: StateSpaceModel, beliefs: Belief, value: Float[Array, "m"], time: Scalar
 ) -> tuple[Belief, Innovation]:
     """Each belief (leading axis) conditioned on the same measurement."""
-    noise_cov = model.measurement.noise_cov()
-    return jax.vmap(lambda belief: updated(belief, model.measurement, noise_cov, value, time))(beliefs)
+    measurement, n_modes = model.measurement, len(beliefs.mean)
+    expected, jacobians = jax.vmap(lambda x: measurement.linearised(x, time))(beliefs.mean)
+    innovations = jax.vmap(lambda z: measurement.difference(value, z))(expected)
+    noise_cov = measurement.noise_cov()
+    noise_covs = jnp.broadcast_to(noise_cov, (n_modes, *noise_cov.shape))
+    return each(linearly_updated)(beliefs, jacobians, noise_covs, innovations, time)
 
 
 def bank_report(model: StateSpaceModel, probability: Float[Array, "n_modes"], beliefs: Belief) -> Estimate:

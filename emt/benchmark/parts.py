@@ -78,6 +78,6 @@ def timed_parts(program: Program, loaded: Loaded) -> tuple[dict[str, Callable[[]
         arguments = (program.world, program.filter_params[label], seed, runs, simulation.scans, simulation.truth)
         add(f"{label}, filter only", bare.scorer(label), arguments)
         add(f"{label}, with metrics", program.scorer(label), arguments)
-        first = jax.tree.map(lambda leaf: leaf[:1], (simulation.scans, simulation.truth))
+        first = jax.tree.map(lambda leaf: leaf[:, :1], (simulation.scans, simulation.truth))
         add(f"{label}{ALONE}", bare.scorer(label), (*arguments[:3], runs[:1], *first))
     return calls, compile_seconds

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from emt.linalg import Mat2, Sym2, Vec2, cholesky
+from emt.linalg import Mat2, Sym2, Vec2, cholesky, once
 from emt.shapes.articulated import body_at, links_of
 from emt.shapes.connected import Body, Connected
 from emt.shapes.linkage import Segment, disc_residual_moments, segment_residual
@@ -94,14 +94,16 @@ def evidence(
         along = 0.5 + samples.points[:, n] / jnp.sqrt(jnp.asarray(12.0, dtype))  # uniform in mean and variance
         noise_root = Mat2.of(cholesky(noise_cov.array())) if rules.augmented else None
 
-        def residuals(state, s, w) -> list[Scalar]:
+        links = once(jax.vmap(lambda state: links_of(plan, state))(states), noise_cov.xx)
+
+        def residuals(links, state, s, w) -> list[Scalar]:
             seen = point if noise_root is None else point - noise_root @ Vec2(w[0], w[1])
-            links = links_of(plan, state)
             flat = [segment_residual(links[link], s, seen) for _, link in segments]
             level = [_level_residual(body, links, state, s, seen) for body in bodies]
             return [entry for h in flat for entry in (h.x, h.y)] + level
 
-        values = jnp.stack(jax.vmap(residuals)(states, along, samples.points[:, n + 1 :]))  # (residual, sample)
+        noise = samples.points[:, n + 1 :]
+        values = jnp.stack(jax.vmap(residuals)(links, states, along, noise))  # (residual, sample)
         center = (values * samples.weights[None, :]).sum(axis=1)
         gaps = values - center[:, None]
         weighted_gaps = gaps * samples.weights[None, :]

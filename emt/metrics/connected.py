@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from emt.linalg import Vec2
+from emt.linalg import Vec2, once
 from emt.metrics.base import FAMILIES, Metric, of_connected, register
-from emt.shapes.articulated import angle_period, boundary_points, distances, mirrored_parameters
+from emt.shapes.articulated import angle_period, boundary_points, distances, links_of, mirrored_parameters
 from emt.shapes.connected import Connected
+from emt.scans import over_batch
 from emt.types import POSITION, VELOCITY, Articulated, Estimate, Info, Point, Scalar, Truth
 
 
@@ -139,12 +140,19 @@ def shape_distance(estimate: Estimate, truth: Truth, info: Info) -> Scalar:
     plan = plan_of(estimate)
     assert plan is not None
 
-    def one_way(a: Float[Array, "n"], b: Float[Array, "n"]) -> Scalar:
-        points, weights = boundary_points(plan, a)
-        gaps = jax.vmap(lambda point: distances(plan, b, Vec2.of(point), outlines=True).min())(points)
-        return (weights * gaps).sum() / jnp.maximum(weights.sum(), jnp.finfo(a.dtype).tiny)
+    objects = [(x, once_each_step(links_of(plan, x), info)) for x in (estimate.mean, truth.state)]
 
-    return 0.5 * (one_way(estimate.mean, truth.state) + one_way(truth.state, estimate.mean))
+    def one_way(a, b) -> Scalar:
+        points, weights = once_each_step(boundary_points(plan, *a), info)
+        gaps = jax.vmap(lambda point: distances(plan, b[0], Vec2.of(point), True, b[1]).min())(points)
+        return (weights * gaps).sum() / jnp.maximum(weights.sum(), jnp.finfo(points.dtype).tiny)
+
+    return 0.5 * (one_way(*objects) + one_way(*reversed(objects)))
+
+
+def once_each_step(values, info: Info):
+    """The same values, computed once (see `linalg.once`); status bits are what the compiler cannot know here."""
+    return once(values, over_batch(-info.status).astype(info.nis.dtype))
 
 
 def no_value(estimate: Estimate, truth: Truth, info: Info) -> Scalar:

@@ -17,7 +17,7 @@ from emt.keys import filter_number
 from emt.models.state_space.measurements import Measurement
 from emt.montecarlo.devices import chunks_at_once
 from emt.montecarlo.fields import truth_fields
-from emt.montecarlo.program import Program, Simulation
+from emt.montecarlo.program import RUNS_OF_SIMULATION, Program, Simulation
 from emt.montecarlo.run import Scores, as_truth
 from emt.status import FAILURE
 from emt.types import Measurements
@@ -79,8 +79,8 @@ def scan_places(measurement: Measurement, scans: Measurements) -> Float[Array, "
 
 
 def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, np.ndarray]:
-    """Scans, and the truth where there is one, of the first `n` runs of a chunk."""
-    simulation = jax.tree.map(lambda leaf: leaf[:n], simulation)
+    """Scans, and the truth where there is one, of the first `n` runs of a chunk, with leading axes run and step."""
+    simulation = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, :n], RUNS_OF_SIMULATION, 0), simulation)
     arrays = {"scans/points": simulation.scans.points, "scans/mask": simulation.scans.mask}
     measurement = getattr(program.world.scenario, "measurement", None)
     if isinstance(measurement, Measurement):
@@ -180,11 +180,12 @@ class Engine:
         simulation = jax.block_until_ready(self._compiled[""](program.world, self.seed, runs))
         target, found = simulation.truth, [{} for _ in ranges]
 
-        def part(tree: Any, k: int) -> Any:
+        def part(tree: Any, k: int, axis: int = 0) -> Any:
             """The share of one chunk."""
             if self.at_once == 1:
                 return tree
-            return jax.tree.map(lambda leaf: np.asarray(leaf)[k * size : (k + 1) * size], tree)
+            mine = (*[slice(None)] * axis, slice(k * size, (k + 1) * size))
+            return jax.tree.map(lambda leaf: np.asarray(leaf)[mine], tree)
 
         def traced(k: int) -> int:
             n = ranges[k][1] - ranges[k][0]
@@ -196,7 +197,7 @@ class Engine:
             scores = jax.block_until_ready(self._compiled[label](*arguments))
             self.seconds[label].append((time.perf_counter() - started) / len(ranges))
             if label == experiment.reference:
-                target = jax.vmap(as_truth)(scores.track)
+                target = jax.vmap(as_truth, out_axes=RUNS_OF_SIMULATION)(scores.track)
             for k, (start, stop) in enumerate(ranges):
                 mine = part(scores, k)
                 found[k] |= score_arrays(label, mine, stop - start)
@@ -204,7 +205,7 @@ class Engine:
                     found[k] |= track_arrays(label, mine, traced(k))
         for k in range(len(ranges)):
             if traced(k):
-                found[k] |= scan_arrays(program, part(simulation, k), traced(k))
+                found[k] |= scan_arrays(program, part(simulation, k, RUNS_OF_SIMULATION), traced(k))
         return found
 
     def run_chunks(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:

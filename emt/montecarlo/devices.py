@@ -18,19 +18,26 @@ def chunks_at_once(chunk_size: int, devices: Sequence[Any]) -> int:
     return per_device * len(devices)
 
 
-def over_runs(function: Callable[..., Any], in_axes: tuple[int | None, ...], devices: Sequence[Any]):
+def over_runs(
+    function: Callable[..., Any], in_axes: tuple[int | None, ...], devices: Sequence[Any], out_axis: int = 0
+) -> Any:
     """The jitted function of one run mapped over runs, an equal share on each device.
 
     Each device runs the program that a single one would run on its share, so the numbers of a run do not depend on how
     many devices there are.
 
     Args:
-        in_axes: 0 for arguments with a leading axis of runs, None for those that all runs share.
+        in_axes: the axis of runs of each argument, None for those that all runs share.
+        out_axis: that of the results.
     """
-    mapped = jax.vmap(function, in_axes=in_axes)
+    mapped = jax.vmap(function, in_axes=in_axes, out_axes=out_axis)
     if len(devices) == 1:
         return jax.jit(mapped)
     mesh = Mesh(np.array(devices), ("runs",))
-    specs = tuple(PartitionSpec() if axis is None else PartitionSpec("runs") for axis in in_axes)
-    shared = jax.shard_map(mapped, mesh=mesh, in_specs=specs, out_specs=PartitionSpec("runs"), check_vma=False)
+
+    def spec(axis: int | None) -> PartitionSpec:
+        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "runs")
+
+    specs = tuple(spec(axis) for axis in in_axes)
+    shared = jax.shard_map(mapped, mesh=mesh, in_specs=specs, out_specs=spec(out_axis), check_vma=False)
     return jax.jit(shared)

@@ -21,10 +21,17 @@ from emt.types import Articulated, Estimate, Info, Measurements, Point, Prior, S
 
 
 class Simulation(NamedTuple):
-    """Truth and scans of a chunk of runs; leading axes run, time."""
+    """Truth and scans of a chunk of runs; leading axes time, run: filters go through it step by step, and each step of
+    all runs lies together in memory."""
 
     truth: Truth
     scans: Measurements
+
+
+RUNS_OF_SIMULATION = 1
+"""Their axis."""
+SCORED = (None, None, None, 0, RUNS_OF_SIMULATION, RUNS_OF_SIMULATION)
+"""Axes of runs of world, parameters, seed, runs, scans and target: what a filter is mapped over."""
 
 
 class WorldParams(NamedTuple):
@@ -172,14 +179,13 @@ class Program:
 
     def simulator(self, devices: Sequence[Any] | None = None) -> Callable[..., Simulation]:
         """Jitted (world, seed, runs) -> Simulation, mapped over runs."""
-        return over_runs(self.simulate_run, (None, None, 0), devices or jax.devices()[:1])
+        return over_runs(self.simulate_run, (None, None, 0), devices or jax.devices()[:1], RUNS_OF_SIMULATION)
 
     def scorer(self, label: str) -> Callable[..., Scores]:
         """Jitted (world, params, seed, runs, scans, target) -> Scores of one filter, mapped over runs."""
-        return over_runs(partial(self.score_run, label), (None, None, None, 0, 0, 0), jax.devices()[:1])
+        return over_runs(partial(self.score_run, label), SCORED, jax.devices()[:1])
 
     def shared_scorer(self, label: str, devices: Sequence[Any] | None = None) -> Callable[..., Scores]:
         """The same with the number of the filter (see `keys.filter_number`) as a last argument: filters that differ in
         label and parameters only are one program, which the cache keeps once."""
-        axes = (None, None, None, 0, 0, 0, None)
-        return over_runs(partial(self.score_run, label), axes, devices or jax.devices()[:1])
+        return over_runs(partial(self.score_run, label), (*SCORED, None), devices or jax.devices()[:1])

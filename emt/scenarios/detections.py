@@ -16,7 +16,7 @@ from emt.draws import normal_pairs, uniform_pairs, unit_disc
 from emt.keys import step_key
 from emt.linalg import Mat2, Vec2, once
 from emt.matrices import Matrix
-from emt.scans import prepared
+from emt.scans import over_batch, prepared
 from emt.settings import NoiseCovariance, Settings
 from emt.trigonometry import sincos
 from emt.types import Measurements, Scalar, Traced, Truth
@@ -81,6 +81,14 @@ def capacity_for(settings: DetectionSettings, n_steps: int, runs: int) -> int:
     return -(-max(int(enough[0]), settings.count.minimum) // VECTOR) * VECTOR
 
 
+def usual_slots(settings: DetectionSettings, capacity: int) -> int:
+    """Slots that are enough for all but one scan in ten thousand: those beyond are drawn only where they are needed."""
+    if isinstance(settings.count, FixedCount):
+        return capacity
+    enough = max(int(poisson.isf(1e-4, settings.count.mean)), settings.count.minimum)
+    return min(-(-enough // VECTOR) * VECTOR, capacity)
+
+
 def noise_root(noise_cov: Matrix) -> Mat2:
     """Lower triangular root of a covariance, which may be singular."""
     (a, b), (_, d) = noise_cov
@@ -142,14 +150,27 @@ def sample_scan(
         count = jnp.asarray(min(settings.count.count, capacity))
         overflow = jnp.asarray(settings.count.count > capacity)
     dtype, chol = truth.position.dtype, params.noise_chol
-    source = sample_source(source_key, settings.source, capacity, dtype)
-    noise = normal_pairs(noise_key, capacity, dtype)
     body = once(body_frame(truth), params.mean_count)
-    # drawn once: the compiler would draw anew for each coordinate and each statistic
-    source, noise = once((source, noise), params.mean_count)
-    x = truth.position[0] + body.xx * source.x + body.xy * source.y + chol.xx * noise.x
-    y = truth.position[1] + body.yx * source.x + body.yy * source.y + chol.yx * noise.x + chol.yy * noise.y
-    x, y = once((x, y), params.mean_count)
+
+    def drawn(n: int) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+        """The first n points."""
+        source = sample_source(source_key, settings.source, n, dtype)
+        noise = normal_pairs(noise_key, n, dtype)
+        # drawn once: the compiler would draw anew for each coordinate and each statistic
+        source, noise = once((source, noise), params.mean_count)
+        x = truth.position[0] + body.xx * source.x + body.xy * source.y + chol.xx * noise.x
+        y = truth.position[1] + body.yx * source.x + body.yy * source.y + chol.yx * noise.x + chol.yy * noise.y
+        return x, y
+
+    usual = usual_slots(settings, capacity)
+    if usual == capacity:
+        x, y = once(drawn(capacity), params.mean_count)
+    else:  # the rest of the slots is empty in nearly every batch
+
+        def few():
+            return tuple(jnp.pad(coordinate, (0, capacity - usual)) for coordinate in drawn(usual))
+
+        x, y = jax.lax.cond(over_batch(count) > usual, lambda: drawn(capacity), few)
     return Measurements(jnp.stack([x, y], axis=1), jnp.arange(capacity) < count, overflow)
 
 

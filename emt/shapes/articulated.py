@@ -105,12 +105,21 @@ def _unit_point(body: Body, axes: Vec2, u: Float[Array, "3"], on_disc: Vec2) -> 
     return Vec2(jnp.where(along_x, x, side), jnp.where(along_x, side, x))
 
 
-def distances(plan: Connected, parameters: Float[Array, "n"], point: Vec2, outlines: bool = False) -> Float[Array, "c"]:
+def distances(
+    plan: Connected,
+    parameters: Float[Array, "n"],
+    point: Vec2,
+    outlines: bool = False,
+    links: Sequence[Segment] | None = None,
+) -> Float[Array, "c"]:
     """Euclidean distance of a point to every component (m); zero on a surface, unless outlines are asked for.
 
     The distance to an ellipse is taken along the ray from its centre. With outlines, discs are infinitely far away.
+
+    Args:
+        links: those of the object in their places, where they are known already.
     """
-    links, found = links_of(plan, parameters), {}
+    links, found = links_of(plan, parameters) if links is None else links, {}
     for component, link in plan.segments:
         segment = links[link]
         local = segment.local(point)
@@ -140,9 +149,15 @@ SHARES = (0.0625, 0.1875, 0.3125, 0.4375, 0.5625, 0.6875, 0.8125, 0.9375)
 """Shares of a segment, or of the outline of a body, at which it stands for itself."""
 
 
-def boundary_points(plan: Connected, parameters: Float[Array, "n"]) -> tuple[Float[Array, "k 2"], Float[Array, "k"]]:
-    """Points along segments and the outlines of bodies, and the length that each stands for (m)."""
-    links, points, weights = links_of(plan, parameters), [], []
+def boundary_points(
+    plan: Connected, parameters: Float[Array, "n"], links: Sequence[Segment] | None = None
+) -> tuple[Float[Array, "k 2"], Float[Array, "k"]]:
+    """Points along segments and the outlines of bodies, and the length that each stands for (m).
+
+    Args:
+        links: those of the object in their places, where they are known already.
+    """
+    links, points, weights = links_of(plan, parameters) if links is None else links, [], []
     shares, count = jnp.asarray(SHARES, parameters.dtype), len(SHARES)
     for _, link in plan.segments:
         segment, reach = links[link], shares * links[link].length

@@ -14,6 +14,7 @@ import numpy as np
 from emt.config.load import Loaded
 from emt.metrics.base import Metric
 from emt.montecarlo.chunks import WORKERS
+from emt.montecarlo.program import RUNS_OF_SIMULATION, SCORED
 from emt.montecarlo.run import as_truth
 from emt.runner import build_program
 from emt.status import FAILURE
@@ -103,14 +104,14 @@ class Batch:
         self.data = Data(seed, runs, simulation.scans, simulation.truth)
         if reference != "truth":
             scores = program.scorer(reference)(program.world, program.filter_params[reference], *self.data)
-            self.data = self.data._replace(target=jax.vmap(as_truth)(scores.track))
+            self.data = self.data._replace(target=jax.vmap(as_truth, out_axes=RUNS_OF_SIMULATION)(scores.track))
 
     def shares(self, make: Callable[..., Any], trial: Trial, data: Data) -> tuple[jax.Array, jax.Array]:
         """Shares (metric, run) and soundness (run) of one candidate; to be compiled."""
         program = dataclasses.replace(self.program, make_filter={self.label: make})
         world = program.world._replace(model=trial.model, prior=trial.prior)
         one = partial(program.score_run, self.label)
-        scores = jax.vmap(one, in_axes=(None, None, None, 0, 0, 0))(world, trial.params, *data)
+        scores = jax.vmap(one, in_axes=SCORED)(world, trial.params, *data)
         sound = (scores.status & int(FAILURE)) == 0
         rows = scores.per_step[:, program.experiment.skip_steps :]
         values = scores.values

@@ -47,7 +47,10 @@ def small(name: str) -> Small:
     program = Program.of(experiment)
     arguments = program.world, jnp.asarray(SEED), jnp.arange(RUNS[name])
     found = program.simulator().lower(*arguments).compile(QUICK_COMPILATION)(*arguments).scans
-    arrays = {"scans/points": np.asarray(found.points), "scans/mask": np.asarray(found.mask)}
+    arrays = {
+        "scans/points": np.swapaxes(np.asarray(found.points), 0, 1),
+        "scans/mask": np.swapaxes(np.asarray(found.mask), 0, 1),
+    }
     return Small(experiment, scans_of(program, arrays, SEED))
 
 

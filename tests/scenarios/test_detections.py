@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import kstest, poisson
 
 from emt.draws import normal_pairs, normals, unit_disc
+from emt.keys import step_key
 from emt.scenarios.detections import (
     OVERFLOW_PROBABILITY,
     DetectionSettings,
@@ -17,6 +18,7 @@ from emt.scenarios.detections import (
     poisson_cdf,
     poisson_count,
     sample_scans,
+    usual_slots,
 )
 from emt.types import Ellipse, Truth
 from tests.filters.cases import FAST_COMPILE
@@ -184,3 +186,25 @@ def test_smallest_number_of_points():
     free = scans_of(settings_of({"kind": "poisson", "mean": 1.0}), 30).mask.sum(axis=1)
     np.testing.assert_array_equal(raised, np.maximum(free, 1))
     assert (free == 0).any()
+
+
+def test_a_full_scan_changes_no_scan_in_its_company():
+    """Slots beyond the usual are drawn for a whole batch where one run needs them: nobody else notices a bit of it."""
+    settings = settings_of({"kind": "poisson", "mean": 10})
+    capacity, usual, n = capacity_for(settings, 1, 1), usual_slots(settings, 48), 16
+    assert (capacity, usual) == (48, 24)
+    params = jax.tree.map(jnp.asarray, params_of(settings))
+    one = jax.tree.map(lambda leaf: leaf[:1], truth())
+    keys = jax.random.split(jax.random.key(5), 40_000)
+    cdf = poisson_cdf(jnp.asarray(10.0), capacity)
+    counts = jax.vmap(lambda key: poisson_count(jax.random.fold_in(step_key(key, 0), 0), cdf)[0])(keys)
+    full, few = jnp.flatnonzero(counts > usual), jnp.flatnonzero(counts <= usual)
+    assert len(full)
+    draw = jax.jit(jax.vmap(lambda key: sample_scans(key, one, settings, params, capacity)))
+    alone, mixed = draw(keys[few[:n]]), draw(keys[jnp.append(few[: n - 1], full[0])])
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[: n - 1], b[: n - 1]), alone, mixed)
+    assert mixed.mask[-1, 0].sum() == counts[full[0]] > usual
+    spread = np.asarray(mixed.points[-1, 0])[np.asarray(mixed.mask[-1, 0])] - CENTRE
+    assert len(np.unique(spread)) == 2 * len(spread)
+    assert (np.abs(spread) > 1e-3).all()
+    assert (np.abs(spread) < 20.0).all()

@@ -6,9 +6,9 @@ from jaxtyping import Array, Float
 
 from emt.linalg import Vec2, once
 from emt.metrics.base import FAMILIES, Metric, of_connected, register
+from emt.scans import over_batch
 from emt.shapes.articulated import angle_period, boundary_points, distances, links_of, mirrored_parameters
 from emt.shapes.connected import Connected
-from emt.scans import over_batch
 from emt.types import POSITION, VELOCITY, Articulated, Estimate, Info, Point, Scalar, Truth
 
 

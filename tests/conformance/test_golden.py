@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emt.conformance.golden import GoldenError, verify
@@ -22,9 +23,12 @@ def test_excerpts_of_golden_vectors(path):
 
 
 def test_moment_vectors_are_made_by_their_program():
+    """Up to the last bits of the square roots, which NumPy's library makes, and what they become."""
     stored = json.loads(moment_update_exact.FILE.read_text())["cases"]
     for case, kept in zip(moment_update_exact.cases(), stored[:3], strict=False):
-        assert {key: moment_update_exact.plain(value) for key, value in case.items()} == kept
+        assert case.keys() == kept.keys()
+        for key, value in case.items():
+            np.testing.assert_allclose(moment_update_exact.plain(value), kept[key], rtol=1e-11, atol=1e-14, err_msg=key)
 
 
 FULL = [

@@ -24,8 +24,8 @@ def uniform_pairs(key: PRNGKeyArray, n: int, dtype) -> tuple[Float[Array, "n"], 
     return first, second
 
 
-def polar(radius, turns) -> Vec2:
-    """The point at that distance, at an angle in turns."""
+def polar(radius: Float[Array, "n"], turns: Float[Array, "n"]) -> Vec2:
+    """The points at these distances, at angles in turns."""
     sine, cosine = sincos_turns(turns)
     return Vec2(radius * cosine, radius * sine)
 
@@ -36,17 +36,25 @@ def unit_disc(key: PRNGKeyArray, n: int, dtype) -> Vec2:
     return polar(jnp.sqrt(u), turns)
 
 
+def gaussian_radius(u):
+    """Distance of a point of the standard Gaussian in the plane from a number uniform on (0, 1)."""
+    return jnp.sqrt(-2.0 * jnp.log(u))
+
+
 def normal_pairs(key: PRNGKeyArray, n: int, dtype) -> Vec2:
     """Points of the standard Gaussian in the plane, none beyond 6.8 standard deviations.
 
     Source: Box and Muller 1958.
     """
     u, turns = uniform_pairs(key, n, dtype)
-    return polar(jnp.sqrt(-2.0 * jnp.log(u)), turns)
+    return polar(gaussian_radius(u), turns)
 
 
 def normals(key: PRNGKeyArray, shape: tuple[int, ...], dtype) -> Float[Array, "..."]:
-    """Independent standard normal numbers."""
+    """Independent standard normal numbers: the coordinates of `normal_pairs`, the first ones first."""
     n = math.prod(shape)
-    pairs = normal_pairs(key, (n + 1) // 2, dtype)
+    half = (n + 1) // 2
+    # one radius too many: else XLA on CPUs writes coordinates over the radii, and such a loop takes them one by one
+    u, turns = uniform_pairs(key, half + 1, dtype)
+    pairs = polar(gaussian_radius(u)[:half], turns[:half])
     return jnp.concatenate([pairs.x, pairs.y])[:n].reshape(shape)

@@ -200,7 +200,7 @@ def particle(
         about = jax.vmap(lambda z: measurement.difference(z, seen[0]))(seen)
         shift = weights @ about
         gaps = about - shift[None, :]
-        cov = (weights[:, None, None] * (gaps[:, :, None] * gaps[:, None, :])).sum(axis=0) + measurement.noise_cov()
+        cov = (weights[:, None] * gaps).T @ gaps + measurement.noise_cov()
         nothing = Belief(jnp.zeros_like(shift), jnp.zeros_like(cov))
         return conditioned(nothing, jnp.zeros_like(cov), cov, measurement.difference(value, seen[0] + shift))[1]
 

@@ -10,6 +10,7 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from emt.linalg import semidefinite_root
+from emt.trigonometry import arctan2
 from emt.types import Scalar, Traced
 
 State = Float[Array, "n"]
@@ -90,7 +91,7 @@ class RangeBearing(Measurement):
 
     def observe(self, state: State, time: Scalar) -> Value:
         dx, dy = state[0] - self.sensor[0], state[1] - self.sensor[1]
-        return jnp.stack([jnp.sqrt(dx * dx + dy * dy), jnp.arctan2(dy, dx)])
+        return jnp.stack([jnp.sqrt(dx * dx + dy * dy), arctan2(dy, dx)])
 
     def noise_cov(self) -> Float[Array, "2 2"]:
         return jnp.diag(jnp.stack([self.range_std * self.range_std, self.bearing_std * self.bearing_std]))

@@ -12,6 +12,7 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from emt.draws import normals
+from emt.lanes import total
 from emt.linalg import Vec2, cholesky, forward_solve, semidefinite_root
 from emt.models.motion import MotionNoise
 from emt.models.turn import coordinated_turn
@@ -54,7 +55,7 @@ def gaussian_log_density(gap: State, cov: Cov) -> Scalar:
     """Log density of a zero-mean Gaussian."""
     root = cholesky(cov)
     white = forward_solve(root, gap)
-    return -0.5 * (white * white).sum() - jnp.log(jnp.diagonal(root)).sum() - 0.5 * len(gap) * math.log(2.0 * math.pi)
+    return -0.5 * total(white * white) - jnp.log(jnp.diagonal(root)).sum() - 0.5 * len(gap) * math.log(2.0 * math.pi)
 
 
 @register_dataclass

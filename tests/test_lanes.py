@@ -115,6 +115,7 @@ def test_the_sum_is_the_sum():
     np.testing.assert_array_equal(total(values[:1]), values[0])
 
 
+@pytest.mark.bits
 def test_once_changes_nothing():
     values = {"a": jnp.asarray(RNG.normal(size=7)), "b": (jnp.asarray(2.0),)}
     through = jax.jit(once)(values, jnp.asarray(0.25))

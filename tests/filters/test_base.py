@@ -83,6 +83,7 @@ def test_a_sound_estimate_has_no_bits():
     assert int(estimate_status(estimate_of(shape=StarConvex(jnp.array([1.0, -0.5]), jnp.asarray(0.0))))) == 0
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("name", [name for name in UNSOUND if name != "infinite radius"])
 def test_guard_keeps_the_last_sound_state_after_an_update(name):
     estimate, bit = UNSOUND[name]
@@ -93,6 +94,7 @@ def test_guard_keeps_the_last_sound_state_after_an_update(name):
     assert int(info.status) == bit
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("name", [name for name in UNSOUND if name != "infinite radius"])
 def test_guard_goes_back_before_an_unsound_prediction(name):
     """The update that follows says so, and the state is that after the last update."""
@@ -122,6 +124,7 @@ def test_guard_looks_at_the_whole_state():
     assert int(info.status) == Status.NON_FINITE
 
 
+@pytest.mark.bits
 def test_guard_lets_a_sound_update_pass():
     new = estimate_of(mean=[5.0, 6.0, 7.0, 8.0])
     flt = guarded(spoiling(updated=new))
@@ -130,6 +133,7 @@ def test_guard_lets_a_sound_update_pass():
     assert int(info.status) == 0
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("scan", [scan_of([[0.0, 0.0]], [False]), scan_of([[np.nan, 0.0]])], ids=["empty", "screened"])
 def test_guard_ignores_updates_without_a_point(scan):
     flt = guarded(spoiling(updated=estimate_of(mean=[5.0, 6.0, 7.0, 8.0])))
@@ -137,6 +141,7 @@ def test_guard_ignores_updates_without_a_point(scan):
     assert_equal(flt.update(start, scan, KEY)[0].state, start.state)
 
 
+@pytest.mark.bits
 def test_company_changes_nothing_behind_the_guard():
     """Sound, unsound and blind runs in one batch, and batches in which all are sound: as each of them alone."""
     flt = guarded(

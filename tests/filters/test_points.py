@@ -141,6 +141,7 @@ def test_a_first_scan_without_a_prediction(rule):
         assert_close([answer.info.log_likelihood[k], answer.info.nis[k]], [log_likelihood, nis])
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(
     "settings", [KALMAN, PREDICTOR, {**UKF, "points": "redrawn"}], ids=["kalman", "predictor", "ukf"]
 )

@@ -102,6 +102,7 @@ def test_inverse_gamma_moments_survive_the_matching():
     assert float(sampled.effective_sample_size(flat)) == pytest.approx(100_000, rel=1e-9)
 
 
+@pytest.mark.bits
 def test_empty_scan_returns_the_prior_exactly():
     flt = build(n=1000)
     key = jax.random.key(0)

@@ -30,6 +30,7 @@ def values(arrays, label="feldmann"):
     return arrays[f"{label}/values"]
 
 
+@pytest.mark.bits
 def test_a_run_is_the_same_in_any_chunk_to_the_bit():
     whole = values(engine().run_chunk(0, 16))
     for start, stop in [(5, 6), (3, 9), (8, 24)]:
@@ -45,6 +46,7 @@ def test_other_chunk_sizes_change_rounding_only():
     )
 
 
+@pytest.mark.bits
 def test_one_more_run_changes_no_other_run():
     np.testing.assert_array_equal(values(engine().run_chunk(0, 9))[:8], values(engine().run_chunk(0, 8)))
 
@@ -52,6 +54,7 @@ def test_one_more_run_changes_no_other_run():
 VB = "  vb: {kind: vb_random_matrix, iterations: 2}\n"
 
 
+@pytest.mark.bits
 def test_one_more_filter_changes_no_other_filter():
     with_vb = engine(text=TEXT.replace("metrics:", VB + "metrics:"))
     both = with_vb.run_chunk(0, 16)
@@ -59,6 +62,7 @@ def test_one_more_filter_changes_no_other_filter():
     assert not np.array_equal(values(both, "vb"), values(both))
 
 
+@pytest.mark.bits
 def test_one_more_padding_slot_changes_no_detection_and_no_result():
     padded = engine("scenario.detections.max_points=25")
     ours, theirs = engine().run_chunk(0, 16, tracked=16), padded.run_chunk(0, 16, tracked=16)

@@ -10,7 +10,7 @@ from emt.metrics.base import find_metric
 from emt.tuning.scoring import Batch
 from emt.tuning.trial import build_trial
 
-RUNS = 208
+RUNS = 104
 METRICS = ("position_rmse", "velocity_rmse", "iou")
 
 # filter: (numbers, tolerances) of position, velocity and IoU; numbers of 200 (B, C) or 300 runs

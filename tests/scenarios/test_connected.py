@@ -86,6 +86,7 @@ def test_clutter_is_even_over_its_rectangle():
     np.testing.assert_allclose(points[is_clutter].var(axis=0), [3.0, 1.0 / 3.0], rtol=0.1)
 
 
+@pytest.mark.bits
 def test_runs_differ_and_repeat():
     np.testing.assert_array_equal(run()[1].points, plain()[1].points)
     assert not np.array_equal(run(key=1)[1].points, plain()[1].points)

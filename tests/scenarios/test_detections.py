@@ -128,6 +128,7 @@ def test_poisson_inversion_is_the_quantile(mean):
     np.testing.assert_array_equal(counts, poisson.ppf(uniform, mean))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("source", ["uniform", "gaussian"])
 def test_more_capacity_changes_no_detection(source):
     """Bit by bit."""
@@ -138,6 +139,7 @@ def test_more_capacity_changes_no_detection(source):
     np.testing.assert_array_equal(wide.points[:, :30][narrow.mask], narrow.points[narrow.mask])
 
 
+@pytest.mark.bits
 def test_longer_tracks_extend_shorter_ones():
     """The same numbers of points at the same places, up to the last digit of programs of different length."""
     settings = settings_of({"kind": "poisson", "mean": 5.0})
@@ -188,6 +190,7 @@ def test_smallest_number_of_points():
     assert (free == 0).any()
 
 
+@pytest.mark.bits
 def test_a_full_scan_changes_no_scan_in_its_company():
     """Slots beyond the usual are drawn for a whole batch where one run needs them: nobody else notices a bit of it."""
     settings = settings_of({"kind": "poisson", "mean": 10})

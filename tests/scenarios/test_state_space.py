@@ -192,6 +192,7 @@ def test_ranges_and_bearings_are_of_the_sensor():
     assert off[..., 1].std() == pytest.approx(np.radians(1.0), rel=0.05)
 
 
+@pytest.mark.bits
 def test_a_longer_experiment_extends_a_shorter_one():
     short, long = (simulate(settings_of(**SWITCHING, steps=n, detection_probability=0.5), 2) for n in (5, 9))
     for ours, theirs in zip(jax.tree.leaves(short), jax.tree.leaves(long), strict=True):

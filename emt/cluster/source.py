@@ -13,7 +13,7 @@ from emt.montecarlo.chunks import Engine
 from emt.montecarlo.program import Program
 
 SHORT_SECONDS = 3.0
-"""Experiments that take less are computed again for the record of costs."""
+"""Experiments that take less are computed again for the record of costs, unless they are in a hurry."""
 
 
 class ChunkSource:
@@ -27,7 +27,11 @@ class ChunkSource:
     def __init__(self, loaded: Loaded, program: Program, pool: Pool | None, *, quick: bool):
         experiment = loaded.experiment
         self._engine = Engine(program, experiment.monte_carlo.seed, experiment.chunk_size, quick=quick)
-        self._pool, self._parcel = pool, pack(loaded, program, quick=quick) if pool is not None else None
+        self._quick, self._pool, self._parcel = (
+            quick,
+            pool,
+            pack(loaded, program, quick=quick) if pool is not None else None,
+        )
         self._compile_seconds = 0.0
         self._environments: list[dict[str, Any]] = []
 
@@ -74,7 +78,7 @@ class ChunkSource:
             workers = {"workers": self._pool.most_workers, "environments": self._environments}
         else:
             workers = {}
-            if done and run_seconds < SHORT_SECONDS and len(done) < 3:
+            if done and run_seconds < SHORT_SECONDS and len(done) < 3 and not self._quick:
                 for _ in range(2):  # the first chunk of a process is slower than the others
                     self._engine.run_chunk(*done[0])
         costs = {"microseconds_per_run_and_step": self._engine.costs()}

@@ -1,7 +1,7 @@
 """An experiment as compiled functions of (seed, run numbers): the simulator and one program per filter."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -66,6 +66,8 @@ class Program:
     make_filter: dict[str, Callable]
     metrics: tuple[Metric, ...]
     n_steps: int
+    _told: dict[str, tuple[Estimate, Info]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """Of each filter, found once: tracing a filter takes a while."""
 
     @staticmethod
     def of(experiment: Experiment) -> "Program":
@@ -128,30 +130,23 @@ class Program:
         return [
             label
             for label in self.filter_params
-            if label == self.experiment.reference or not has(metric, self.estimate_of(label), self.info_of(label))
+            if label == self.experiment.reference or not has(metric, *self.told_by(label))
         ]
 
-    def estimate_of(self, label: str) -> Estimate:
-        """Shapes and names of a filter's reports."""
+    def told_by(self, label: str) -> tuple[Estimate, Info]:
+        """Shapes and names of a filter's reports, and what it tells of its updates."""
+        if label not in self._told:
+            self._told[label] = jax.eval_shape(lambda: self._first(label))
+        return self._told[label]
 
-        def first():
-            flt = self.make_filter[label](self.filter_params[label], self.world.model)
-            return flt.estimate(flt.init(self.world.prior, jax.random.key(0)))
-
-        return jax.eval_shape(first)
-
-    def info_of(self, label: str) -> Info:
-        """What a filter tells of its updates."""
+    def _first(self, label: str) -> tuple[Estimate, Info]:
+        """The first report and update of a filter."""
+        flt, key = self.make_filter[label](self.filter_params[label], self.world.model), jax.random.key(0)
+        state = flt.init(self.world.prior, key)
         if not any(metric.reads for metric in self.metrics):
-            return Info(jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))  # no need to trace the update
-
-        def first():
-            flt, key = self.make_filter[label](self.filter_params[label], self.world.model), jax.random.key(0)
-            scans = self.simulate_run(self.world, jnp.asarray(0), jnp.asarray(0)).scans
-            scan = jax.tree.map(lambda leaf: leaf[0], scans)
-            return flt.update(flt.init(self.world.prior, key), scan, key)[1]
-
-        return jax.eval_shape(first)
+            return flt.estimate(state), Info(jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))  # no update is traced
+        scans = self.simulate_run(self.world, jnp.asarray(0), jnp.asarray(0)).scans
+        return flt.estimate(state), flt.update(state, jax.tree.map(lambda leaf: leaf[0], scans), key)[1]
 
     def tells_mode(self) -> bool:
         """Whether the scenario tells the true mode."""
@@ -160,7 +155,7 @@ class Program:
 
     def state_names(self) -> list[str]:
         """Names of the entries of the filters' means."""
-        shape = self.estimate_of(next(iter(self.filter_params))).shape
+        shape = self.told_by(next(iter(self.filter_params)))[0].shape
         if isinstance(shape, Point):
             return list(shape.names)
         return list(shape.plan.state) if isinstance(shape, Articulated) else ["x", "y", "vx", "vy"]
@@ -170,12 +165,12 @@ class Program:
         if metric.unit_of is None:
             return metric.unit
         having = [label for label in self.filter_params if label not in self.without(metric)]
-        return metric.unit_of(self.estimate_of(having[0])) if having else metric.unit
+        return metric.unit_of(self.told_by(having[0])[0]) if having else metric.unit
 
     def dof_of(self, metric: Metric) -> int:
         """Degrees of freedom of a metric that is a normalised square."""
         having = [label for label in self.filter_params if label not in self.without(metric)]
-        return metric.dof(self.estimate_of(having[0])) if metric.dof is not None and having else 0
+        return metric.dof(self.told_by(having[0])[0]) if metric.dof is not None and having else 0
 
     def simulator(self, devices: Sequence[Any] | None = None) -> Callable[..., Simulation]:
         """Jitted (world, seed, runs) -> Simulation, mapped over runs."""

@@ -1,11 +1,13 @@
 """Many runs: chunks of fixed size, from run numbers to the arrays that are stored."""
 
+import gc
 import itertools
 import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -99,6 +101,18 @@ QUICK_COMPILATION: dict[str, Any] = COMPILATION | {"xla_backend_optimization_lev
 """Options for programs that run once on few runs: compiling takes longer than running. Results differ in rounding."""
 
 
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """Garbage is collected later: going through the many objects of traced programs is a fifth of a warm start."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
 class Engine:
     """Runs chunks of one experiment; compiled once, for the chunk size.
 
@@ -138,7 +152,6 @@ class Engine:
             return
         program, runs = self.program, jnp.zeros(self.chunk_size * self.at_once, int)
         simulator = program.simulator(self.devices)
-        shapes = jax.eval_shape(simulator, program.world, self.seed, runs)
 
         def build(name: str):
             on_start(name or "scenario")
@@ -148,7 +161,8 @@ class Engine:
             return program.shared_scorer(name, self.devices).lower(*arguments).compile(self.options)
 
         names = ["", *self.labels()]
-        with ThreadPoolExecutor(WORKERS) as pool:
+        with without_collection(), ThreadPoolExecutor(WORKERS) as pool:
+            shapes = jax.eval_shape(simulator, program.world, self.seed, runs)
             self._compiled = dict(zip(names, pool.map(build, names), strict=True))
 
     def arguments(self, label: str, runs, scans, target) -> tuple[Any, ...]:

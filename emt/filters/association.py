@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from emt.linalg import Mat2, Sym2, Vec2, cholesky, once
 from emt.shapes.articulated import body_at, links_of
 from emt.shapes.connected import Body, Connected
-from emt.shapes.linkage import Segment, disc_residual_moments, segment_residual
+from emt.shapes.linkage import Segment, disc_residual_moments, headings, segment_residual
 from emt.types import Scalar
 
 
@@ -94,16 +94,17 @@ def evidence(
         along = 0.5 + samples.points[:, n] / jnp.sqrt(jnp.asarray(12.0, dtype))  # uniform in mean and variance
         noise_root = Mat2.of(cholesky(noise_cov.array())) if rules.augmented else None
 
-        links = once(jax.vmap(lambda state: links_of(plan, state))(states), noise_cov.xx)
+        known = once(jax.vmap(lambda state: headings(plan.links, state))(states), noise_cov.xx)
 
-        def residuals(links, state, s, w) -> list[Scalar]:
+        def residuals(known, state, s, w) -> list[Scalar]:
+            links = links_of(plan, state, known)
             seen = point if noise_root is None else point - noise_root @ Vec2(w[0], w[1])
             flat = [segment_residual(links[link], s, seen) for _, link in segments]
             level = [_level_residual(body, links, state, s, seen) for body in bodies]
             return [entry for h in flat for entry in (h.x, h.y)] + level
 
         noise = samples.points[:, n + 1 :]
-        values = jnp.stack(jax.vmap(residuals)(links, states, along, noise))  # (residual, sample)
+        values = jnp.stack(jax.vmap(residuals)(known, states, along, noise))  # (residual, sample)
         center = (values * samples.weights[None, :]).sum(axis=1)
         gaps = values - center[:, None]
         weighted_gaps = gaps * samples.weights[None, :]

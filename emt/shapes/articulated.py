@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from emt.linalg import Mat2, Vec2
 from emt.shapes.connected import Body, Connected
-from emt.shapes.linkage import Segment, place
+from emt.shapes.linkage import Heading, Segment, place
 from emt.types import Articulated, Scalar
 
 
@@ -28,9 +28,9 @@ def as_vec(pair: tuple[float, float], like: Array) -> Vec2:
     return Vec2(jnp.asarray(pair[0], like.dtype), jnp.asarray(pair[1], like.dtype))
 
 
-def links_of(plan: Connected, parameters: Float[Array, "n"]) -> list[Segment]:
-    """Every link of an object in its place."""
-    return place(plan.links, parameters, as_vec(plan.origin, parameters))
+def links_of(plan: Connected, parameters: Float[Array, "n"], known: Sequence[Heading] | None = None) -> list[Segment]:
+    """Every link of an object in its place; `known` as in `linkage.place`."""
+    return place(plan.links, parameters, as_vec(plan.origin, parameters), known)
 
 
 def body_at(body: Body, links: Sequence[Segment], parameters: Float[Array, "n"]) -> Placed:

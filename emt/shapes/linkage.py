@@ -46,17 +46,39 @@ class Segment(NamedTuple):
         return Vec2(self.cos * x + self.sin * y, self.cos * y - self.sin * x)
 
 
-def place(links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2) -> list[Segment]:
-    """Every link in its place, for one vector of parameters."""
-    placed: list[Segment] = []
+class Heading(NamedTuple):
+    """Where a link points."""
+
+    direction: Scalar
+    """Angle against the x axis (rad)."""
+    cos: Scalar
+    sin: Scalar
+
+
+def headings(links: Sequence[Link], parameters: Float[Array, "n"]) -> list[Heading]:
+    """Where every link points, for one vector of parameters."""
+    found: list[Heading] = []
     for link in links:
-        parent = None if link.parent is None else placed[link.parent]
         turned = sum((factor * parameters[k] for k, factor in link.angle), jnp.asarray(link.offset, parameters.dtype))
-        length = parameters[link.length] if isinstance(link.length, int) else jnp.asarray(link.length, parameters.dtype)
-        start = origin if parent is None else parent.at(jnp.ones_like(length))
-        direction = turned if parent is None else parent.direction + turned
+        direction = turned if link.parent is None else found[link.parent].direction + turned
         sin, cos = sincos(direction)
-        placed.append(Segment(start, direction, length, cos, sin))
+        found.append(Heading(direction, cos, sin))
+    return found
+
+
+def place(
+    links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2, known: Sequence[Heading] | None = None
+) -> list[Segment]:
+    """Every link in its place, for one vector of parameters.
+
+    Args:
+        known: where the links point, where that is known already.
+    """
+    placed: list[Segment] = []
+    for link, heading in zip(links, headings(links, parameters) if known is None else known, strict=True):
+        length = parameters[link.length] if isinstance(link.length, int) else jnp.asarray(link.length, parameters.dtype)
+        start = origin if link.parent is None else placed[link.parent].at(jnp.ones_like(length))
+        placed.append(Segment(start, heading.direction, length, heading.cos, heading.sin))
     return placed
 
 

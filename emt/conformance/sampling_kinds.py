@@ -57,7 +57,7 @@ def _range_bearing(y):
 def _link(links: tuple[Link, ...], last: int, y):
     def h(x, noise):
         segment = place(links, x, Vec2(jnp.zeros(()), jnp.zeros(())))[last]
-        return segment_residual(segment, _share(noise[0]), Vec2.of(y)).array()
+        return segment_residual(segment.length, _share(noise[0]), segment.local(Vec2.of(y))).array()
 
     return h
 

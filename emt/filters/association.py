@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from emt.linalg import Mat2, Sym2, Vec2, cholesky, once
-from emt.shapes.articulated import body_at, links_of
+from emt.shapes.articulated import as_vec, semi_axes_of
 from emt.shapes.connected import Body, Connected
-from emt.shapes.linkage import Segment, disc_residual_moments, headings, segment_residual
+from emt.shapes.linkage import disc_residual_moments, in_frames, length_of, segment_residual, turns_of
 from emt.types import Scalar
 
 
@@ -69,7 +69,7 @@ def evidence(
 ) -> Evidence:
     """Sampling Kalman updates of one belief by one point, as if each component were its source.
 
-    All components share one square root L of the covariance, one set of samples u and one placement of the chain. The
+    All components share one square root L of the covariance, one set of samples u and one pass along the chain. The
     samples are the same for every run, so both products with them, the steps L u and the covariances L Σ w u hᵀ of
     state and residuals, are one product of matrices for a whole batch. A disc reads no parameter: its update is the
     identity, exactly.
@@ -94,17 +94,17 @@ def evidence(
         along = 0.5 + samples.points[:, n] / jnp.sqrt(jnp.asarray(12.0, dtype))  # uniform in mean and variance
         noise_root = Mat2.of(cholesky(noise_cov.array())) if rules.augmented else None
 
-        known = once(jax.vmap(lambda state: headings(plan.links, state))(states), noise_cov.xx)
+        turns = once(jax.vmap(lambda state: turns_of(plan.links, state))(states), noise_cov.xx)
 
-        def residuals(known, state, s, w) -> list[Scalar]:
-            links = links_of(plan, state, known)
+        def residuals(turns, state, s, w) -> list[Scalar]:
             seen = point if noise_root is None else point - noise_root @ Vec2(w[0], w[1])
-            flat = [segment_residual(links[link], s, seen) for _, link in segments]
-            level = [_level_residual(body, links, state, s, seen) for body in bodies]
+            local = in_frames(plan.links, turns, state, as_vec(plan.origin, state), seen)
+            flat = [segment_residual(length_of(plan.links[link], state), s, local[link]) for _, link in segments]
+            level = [_level_residual(semi_axes_of(body, state), body, s, local[body.link]) for body in bodies]
             return [entry for h in flat for entry in (h.x, h.y)] + level
 
         noise = samples.points[:, n + 1 :]
-        values = jnp.stack(jax.vmap(residuals)(known, states, along, noise))  # (residual, sample)
+        values = jnp.stack(jax.vmap(residuals)(turns, states, along, noise))  # (residual, sample)
         center = (values * samples.weights[None, :]).sum(axis=1)
         gaps = values - center[:, None]
         weighted_gaps = gaps * samples.weights[None, :]
@@ -159,14 +159,13 @@ def _disc(radius: float, at: tuple[float, float], dtype, point: Vec2, noise_cov:
     return log_density + jnp.log(jnp.asarray(rules.disc_density_factor, dtype)), h * h / variance
 
 
-def _level_residual(body: Body, links: list[Segment], state, s, point: Vec2) -> Scalar:
+def _level_residual(semi_axes: Vec2, body: Body, s, local: Vec2) -> Scalar:
     """h = a b (g² - s²) of a random hypersurface: g is 1 on the outline and grows linearly along every ray (m²).
 
     Surfaces have s² uniform on (0, 1), outlines s = 1. With the factor a b of the semi-axes a circle has the residual
     of a disc, and h a constant density per area. Source: Baum and Hanebeck 2009.
     """
-    placed, local = body_at(body, links, state), links[body.link].local(point)
-    a, b = placed.semi_axes.x, placed.semi_axes.y
+    a, b = semi_axes.x, semi_axes.y
     x2, y2 = b / a * local.x * local.x, a / b * local.y * local.y
     level = jnp.maximum(x2, y2) if body.is_rectangle else x2 + y2
     return level - a * b * (s if body.is_filled else 1.0)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from emt.linalg import Mat2, Vec2
 from emt.shapes.connected import Body, Connected
-from emt.shapes.linkage import Heading, Segment, place
+from emt.shapes.linkage import Segment, place
 from emt.types import Articulated, Scalar
 
 
@@ -28,15 +28,19 @@ def as_vec(pair: tuple[float, float], like: Array) -> Vec2:
     return Vec2(jnp.asarray(pair[0], like.dtype), jnp.asarray(pair[1], like.dtype))
 
 
-def links_of(plan: Connected, parameters: Float[Array, "n"], known: Sequence[Heading] | None = None) -> list[Segment]:
-    """Every link of an object in its place; `known` as in `linkage.place`."""
-    return place(plan.links, parameters, as_vec(plan.origin, parameters), known)
+def links_of(plan: Connected, parameters: Float[Array, "n"]) -> list[Segment]:
+    """Every link of an object in its place."""
+    return place(plan.links, parameters, as_vec(plan.origin, parameters))
+
+
+def semi_axes_of(body: Body, parameters: Float[Array, "n"]) -> Vec2:
+    """Both semi-axes of a body (m)."""
+    return Vec2(*(parameters[x] if isinstance(x, int) else jnp.asarray(x, parameters.dtype) for x in body.semi_axes))
 
 
 def body_at(body: Body, links: Sequence[Segment], parameters: Float[Array, "n"]) -> Placed:
     """A body on the placed links of its object."""
-    a, b = (parameters[x] if isinstance(x, int) else jnp.asarray(x, parameters.dtype) for x in body.semi_axes)
-    return Placed(links[body.link].start, links[body.link].direction, Vec2(a, b))
+    return Placed(links[body.link].start, links[body.link].direction, semi_axes_of(body, parameters))
 
 
 def segments_of(shape: Articulated) -> list[Segment]:

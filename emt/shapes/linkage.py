@@ -46,49 +46,72 @@ class Segment(NamedTuple):
         return Vec2(self.cos * x + self.sin * y, self.cos * y - self.sin * x)
 
 
-class Heading(NamedTuple):
-    """Where a link points."""
+def length_of(link: Link, parameters: Float[Array, "n"]) -> Scalar:
+    """The length of a link (m)."""
+    return parameters[link.length] if isinstance(link.length, int) else jnp.asarray(link.length, parameters.dtype)
 
-    direction: Scalar
-    """Angle against the x axis (rad)."""
+
+def place(links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2) -> list[Segment]:
+    """Every link in its place, for one vector of parameters."""
+    placed: list[Segment] = []
+    for link in links:
+        parent = None if link.parent is None else placed[link.parent]
+        turned = sum((factor * parameters[k] for k, factor in link.angle), jnp.asarray(link.offset, parameters.dtype))
+        length = length_of(link, parameters)
+        start = origin if parent is None else parent.at(jnp.ones_like(length))
+        direction = turned if parent is None else parent.direction + turned
+        sin, cos = sincos(direction)
+        placed.append(Segment(start, direction, length, cos, sin))
+    return placed
+
+
+class Turn(NamedTuple):
+    """How far a link is turned against its parent."""
+
     cos: Scalar
     sin: Scalar
 
 
-def headings(links: Sequence[Link], parameters: Float[Array, "n"]) -> list[Heading]:
-    """Where every link points, for one vector of parameters."""
-    found: list[Heading] = []
+def turns_of(links: Sequence[Link], parameters: Float[Array, "n"]) -> list[Turn]:
+    """Every link's turn against its parent, or against the x axis; links that turn oppositely share sine and cosine."""
+    known: dict[tuple, Turn] = {}
+    found: list[Turn] = []
     for link in links:
-        turned = sum((factor * parameters[k] for k, factor in link.angle), jnp.asarray(link.offset, parameters.dtype))
-        direction = turned if link.parent is None else found[link.parent].direction + turned
-        sin, cos = sincos(direction)
-        found.append(Heading(direction, cos, sin))
+        opposite = known.get((tuple((k, -factor) for k, factor in link.angle), -link.offset))
+        if opposite is None:
+            offset = jnp.asarray(link.offset, parameters.dtype)
+            sin, cos = sincos(sum((factor * parameters[k] for k, factor in link.angle), offset))
+            found.append(Turn(cos, sin))
+        else:
+            found.append(Turn(opposite.cos, -opposite.sin))
+        known[link.angle, link.offset] = found[-1]
     return found
 
 
-def place(
-    links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2, known: Sequence[Heading] | None = None
-) -> list[Segment]:
-    """Every link in its place, for one vector of parameters.
+def in_frames(
+    links: Sequence[Link], turns: Sequence[Turn], parameters: Float[Array, "n"], origin: Vec2, point: Vec2
+) -> list[Vec2]:
+    """A point in the frame of every link, along it and to its left, as `Segment.local` has it: from frame to frame, one
+    turn and one length at a time."""
+    found: list[Vec2] = []
+    for link, turn in zip(links, turns, strict=True):
+        gap = point - origin
+        if link.parent is not None:
+            before = found[link.parent]
+            gap = Vec2(before.x - length_of(links[link.parent], parameters), before.y)
+        found.append(Vec2(turn.cos * gap.x + turn.sin * gap.y, turn.cos * gap.y - turn.sin * gap.x))
+    return found
 
-    Args:
-        known: where the links point, where that is known already.
-    """
-    placed: list[Segment] = []
-    for link, heading in zip(links, headings(links, parameters) if known is None else known, strict=True):
-        length = parameters[link.length] if isinstance(link.length, int) else jnp.asarray(link.length, parameters.dtype)
-        start = origin if link.parent is None else placed[link.parent].at(jnp.ones_like(length))
-        placed.append(Segment(start, heading.direction, length, heading.cos, heading.sin))
-    return placed
 
-
-def segment_residual(segment: Segment, share: Scalar, point: Vec2) -> Vec2:
+def segment_residual(length: Scalar, share: Scalar, local: Vec2) -> Vec2:
     """h = [l s; 0] - R(β)ᵀ (y - p): zero where the point lies at that share of the segment, in its own frame (m).
 
     The map from point to residual is a rigid motion, so densities of h are densities per area.
+
+    Args:
+        local: the point y in the frame of the segment, R(β)ᵀ (y - p).
     """
-    local = segment.local(point)
-    return Vec2(segment.length * share - local.x, -local.y)
+    return Vec2(length * share - local.x, -local.y)
 
 
 def disc_residual_moments(

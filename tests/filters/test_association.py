@@ -45,7 +45,7 @@ def test_each_segment_is_updated_as_if_alone(belief, point):
 
         def h(x, w, link=link):
             segment = place(ARM.links, x, ORIGIN)[link]
-            return segment_residual(segment, 0.5 + w[0] / jnp.sqrt(12.0), at(*point)).array()
+            return segment_residual(segment.length, 0.5 + w[0] / jnp.sqrt(12.0), segment.local(at(*point))).array()
 
         moments = sampled_moments(mean, cholesky(cov), samples, noise * jnp.eye(2), h)
         alone = conditioned(mean, cov, moments)

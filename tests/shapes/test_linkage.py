@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emt.linalg import Vec2
-from emt.shapes.linkage import Link, disc_residual_moments, place, segment_residual
+from emt.shapes.linkage import Link, disc_residual_moments, in_frames, place, segment_residual, turns_of
 
 # an upper arm, a lower arm turned against it by its own parameter, a branch of fixed length from the upper arm
 LINKS = (
@@ -32,13 +32,27 @@ def test_placement_against_complex_numbers(x):
         np.testing.assert_allclose([tip.x, tip.y], [end.real, end.imag], atol=1e-12)
 
 
+@given(st.tuples(NUMBER, NUMBER, NUMBER, NUMBER), st.tuples(NUMBER, NUMBER))
+def test_from_frame_to_frame_a_point_is_where_its_links_say(x, at):
+    """With a link that turns against the last one but oppositely, which shares its sine and cosine."""
+    links = (*LINKS, Link(1, ((2, 0.5), (1, -0.25)), -0.3, 1.5), Link(3, ((1, 1.0),), 0.0, 2))
+    parameters, point = jnp.array(x), Vec2(*map(jnp.asarray, at))
+    turns = turns_of(links, parameters)
+    for found, segment in zip(
+        in_frames(links, turns, parameters, ORIGIN, point), place(links, parameters, ORIGIN), strict=True
+    ):
+        expected = segment.local(point)
+        np.testing.assert_allclose([found.x, found.y], [expected.x, expected.y], atol=1e-13)
+    assert turns[3].cos is turns[2].cos
+
+
 @given(share=st.floats(0.0, 1.0), dx=NUMBER, dy=NUMBER, angle=NUMBER)
 def test_the_residual_is_a_rigid_motion_of_the_point(share, dx, dy, angle):
     segment = place(LINKS, jnp.array([1.3, angle, 0.4, 0.9]), ORIGIN)[0]
     on = segment.at(jnp.asarray(share))
-    there = segment_residual(segment, jnp.asarray(share), on)
+    there = segment_residual(segment.length, jnp.asarray(share), segment.local(on))
     np.testing.assert_allclose(there.array(), 0.0, atol=1e-12)
-    away = segment_residual(segment, jnp.asarray(share), Vec2(on.x + dx, on.y + dy))
+    away = segment_residual(segment.length, jnp.asarray(share), segment.local(Vec2(on.x + dx, on.y + dy)))
     assert float(away.x**2 + away.y**2) == pytest.approx(dx * dx + dy * dy, abs=1e-10)
 
 

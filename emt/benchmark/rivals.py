@@ -14,6 +14,7 @@ import numpy as np
 from emt.benchmark.peers import PEERS, installed
 from emt.benchmark.peers.agreement import error_difference, largest_difference
 from emt.benchmark.peers.base import ELLIPSE, Scans
+from emt.benchmark.standard import WORKLOADS
 from emt.benchmark.workloads import Bench
 from emt.config.load import load_experiment
 from emt.config.shipped import SHIPPED
@@ -48,7 +49,7 @@ class Rival(NamedTuple):
     version: str
     """Package and version."""
     runs: int
-    """The first of the workload, on which it is checked and timed."""
+    """The first of the workload, on which it is checked and timed; it may take all of them more than once."""
     exact: bool
     """Whether it computes the same but for rounding."""
     columns: tuple[str, ...] | None
@@ -101,7 +102,7 @@ def agreement(rival: Rival, bench: Bench) -> Agreement:
             message = f"the largest relative difference is {difference:.1e}, more than {LARGEST_DIFFERENCE:.0e}"
             raise DisagreementError(f"{bench.name}: {rival.name} does not report what emt does: {message}")
         return Agreement(difference)
-    gap, error = error_difference(found, own, bench.arrays["truth/state"][: rival.runs])
+    gap, error = error_difference(found, own, bench.arrays["truth/state"][: len(own)])
     if not abs(gap) <= STANDARD_ERRORS * error:
         message = f"position errors differ by {gap:.3g} m, with a standard error of {error:.3g} m"
         raise DisagreementError(f"{bench.name}: {rival.name} does not report what emt does: {message}")
@@ -126,9 +127,10 @@ def rivals_of(bench: Bench, *, peers: bool) -> tuple[list[Rival], list[Missing]]
 
 
 def first(scans: Scans, runs: int) -> Scans:
-    """Scans of the first runs."""
-    means = None if scans.prior_means is None else scans.prior_means[:runs]
-    return Scans(scans.points[:runs], scans.mask[:runs], means)
+    """Scans of the first runs; of more than there are, all of them again and again."""
+    chosen = np.arange(runs) % len(scans.points)
+    means = None if scans.prior_means is None else scans.prior_means[chosen]
+    return Scans(scans.points[chosen], scans.mask[chosen], means)
 
 
 @contextmanager
@@ -153,7 +155,8 @@ def numpy_references(bench: Bench) -> list[Rival | Missing]:
         given = module.Scans(*first(bench.scans, runs))
         return Rival(title, name, runs, reference.exact, None, lambda: form(experiment, given))
 
-    return [rival(BATCHED, reference.batched, bench.runs), rival(PER_RUN, reference.per_run, bench.few)]
+    many = WORKLOADS[bench.name].many
+    return [rival(BATCHED, reference.batched, many), rival(PER_RUN, reference.per_run, bench.few)]
 
 
 def plain_form(bench: Bench) -> Rival | Missing:

@@ -9,13 +9,15 @@ class Workload(NamedTuple):
     number: str
     few: int
     """Runs given to what takes one run after the other."""
+    many: int
+    """Runs given at once to batched NumPy: as many as it is fastest with, more than emt needs."""
 
 
 WORKLOADS = {
-    "vb": Workload("W1", 4),
-    "mem_ekf_star": Workload("W2", 4),
-    "moment_ukf": Workload("W3", 2),
-    "shape_mixture": Workload("W4", 2),
-    "multiple_model": Workload("W5", 4),
-    "particle": Workload("W6", 8),
+    "vb": Workload("W1", 4, 1664),
+    "mem_ekf_star": Workload("W2", 4, 1664),
+    "moment_ukf": Workload("W3", 2, 1664),
+    "shape_mixture": Workload("W4", 2, 832),
+    "multiple_model": Workload("W5", 4, 832),
+    "particle": Workload("W6", 8, 26),
 }

@@ -113,7 +113,7 @@ def method_of(results: Mapping[str, Any]) -> list[str]:
         f"all its threads, wall clock beside it. Calls of more than {LONG_SECONDS:.0f} s are repeated at most {FEWEST} "
         "times.",
         "All are given the same simulated scans, and every rival is checked before it is timed: its largest relative "
-        "difference from emt is shown (or that of position errors, where random numbers differ). Batched NumPy is given "
+        "difference from emt is shown (or that of position errors, where random numbers differ). Batched NumPy gets "
         "these runs again and again, as many at once as it is fastest with. Ratios are of CPU times per run and step. "
         "Compilation is tracing, lowering and compiling simulator and filter in a process of "
         "its own.",

@@ -46,6 +46,11 @@ class Segment(NamedTuple):
         return Vec2(self.cos * x + self.sin * y, self.cos * y - self.sin * x)
 
 
+def angle_of(link: Link, parameters: Float[Array, "n"]) -> Scalar:
+    """The angle of a link against its parent, or against the x axis (rad)."""
+    return sum((factor * parameters[k] for k, factor in link.angle), jnp.asarray(link.offset, parameters.dtype))
+
+
 def length_of(link: Link, parameters: Float[Array, "n"]) -> Scalar:
     """The length of a link (m)."""
     return parameters[link.length] if isinstance(link.length, int) else jnp.asarray(link.length, parameters.dtype)
@@ -56,8 +61,7 @@ def place(links: Sequence[Link], parameters: Float[Array, "n"], origin: Vec2) ->
     placed: list[Segment] = []
     for link in links:
         parent = None if link.parent is None else placed[link.parent]
-        turned = sum((factor * parameters[k] for k, factor in link.angle), jnp.asarray(link.offset, parameters.dtype))
-        length = length_of(link, parameters)
+        turned, length = angle_of(link, parameters), length_of(link, parameters)
         start = origin if parent is None else parent.at(jnp.ones_like(length))
         direction = turned if parent is None else parent.direction + turned
         sin, cos = sincos(direction)
@@ -79,8 +83,7 @@ def turns_of(links: Sequence[Link], parameters: Float[Array, "n"]) -> list[Turn]
     for link in links:
         opposite = known.get((tuple((k, -factor) for k, factor in link.angle), -link.offset))
         if opposite is None:
-            offset = jnp.asarray(link.offset, parameters.dtype)
-            sin, cos = sincos(sum((factor * parameters[k] for k, factor in link.angle), offset))
+            sin, cos = sincos(angle_of(link, parameters))
             found.append(Turn(cos, sin))
         else:
             found.append(Turn(opposite.cos, -opposite.sin))

@@ -25,7 +25,7 @@ CHECKED = {
 
 
 @cache
-def summary(name: str, folder, runs: int = 200, seed: int = 20051):
+def summary(name: str, folder, runs: int = 120, seed: int = 20051):
     """Summary of an experiment with other random numbers than those of the report."""
     kept = ", ".join(CHECKED[name])
     scale = [f"monte_carlo.smoke_runs={runs}", f"monte_carlo.smoke_filters=[{kept}]", f"monte_carlo.seed={seed}"]

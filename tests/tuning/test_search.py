@@ -123,12 +123,6 @@ def test_a_gradient_goes_downhill(moments):
     assert all(float(f"{value:.4g}") == value for value in outcome.values)
 
 
-def test_a_start_that_cannot_be_bettered_stays(small):
-    found = parse_parameters(["filters.feldmann.weight=8"], small, grid=True)
-    outcome = search(small, "feldmann", found, plan_of(small, "grid", "gw", **NUMBERS))
-    assert outcome.values == (8,)
-
-
 @pytest.mark.parametrize(
     ("objective", "message"),
     [("nees", "no better or worse"), ("gw_std", "no better or worse"), ("gv", "unknown metric 'gv'")],

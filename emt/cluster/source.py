@@ -27,11 +27,8 @@ class ChunkSource:
     def __init__(self, loaded: Loaded, program: Program, pool: Pool | None, *, quick: bool):
         experiment = loaded.experiment
         self._engine = Engine(program, experiment.monte_carlo.seed, experiment.chunk_size, quick=quick)
-        self._quick, self._pool, self._parcel = (
-            quick,
-            pool,
-            pack(loaded, program, quick=quick) if pool is not None else None,
-        )
+        self._quick, self._pool = quick, pool
+        self._parcel = None if pool is None else pack(loaded, program, quick=quick)
         self._compile_seconds = 0.0
         self._environments: list[dict[str, Any]] = []
 

@@ -73,6 +73,29 @@ def _(axis_size, in_batched, number):
     return (number.max(axis=0) if in_batched[0] else number), False
 
 
+@jax.custom_batching.custom_vmap
+def of_each_run(values, own):
+    """The same values, one for each run of a batch even where all runs share them.
+
+    What a loop carries on is then each run's own from the start; else mapping the loop traces its body once more to
+    find that out, which is half of all tracing.
+
+    Args:
+        own: anything that differs between runs, such as a key.
+    """
+    return values
+
+
+@of_each_run.def_vmap
+def _(axis_size, in_batched, values, own):
+    every = jax.tree.map(
+        lambda leaf, is_own: leaf if is_own else jnp.broadcast_to(leaf, (axis_size, *leaf.shape)),
+        values,
+        in_batched[0],
+    )
+    return every, jax.tree.map(lambda _: True, values)
+
+
 def all_of_batch(condition: Bool[Array, ""]) -> Bool[Array, ""]:
     """Whether a condition holds for all runs of a batch: what is chosen by it is computed for all of them or for none.
 

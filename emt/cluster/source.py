@@ -76,7 +76,6 @@ class ChunkSource:
         else:
             workers = {}
             if done and run_seconds < SHORT_SECONDS and len(done) < 3 and not self._quick:
-                for _ in range(2):  # the first chunk of a process is slower than the others
-                    self._engine.run_chunk(*done[0])
+                self._engine.run_chunk(*done[0])
         costs = {"microseconds_per_run_and_step": self._engine.costs()}
         return {"compile_seconds": self._compile_seconds} | costs | workers

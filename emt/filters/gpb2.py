@@ -1,7 +1,9 @@
 """Generalised pseudo-Bayes of second order over any filters that can merge their states."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
@@ -15,8 +17,18 @@ class Gpb2State(NamedTuple):
 
     log_probability: Float[Array, "n_modes n_modes"]
     """From (row), to (column)."""
-    pairs: tuple[tuple[State, ...], ...]
-    """In the order [to][from]."""
+    histories: tuple[State, ...]
+    """Of every mode, its states from each mode before, with a leading axis."""
+
+
+def stacked(states: Sequence[State]) -> State:
+    """States of one kind as one, with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+
+
+def unstacked(states: State, n: int) -> tuple[State, ...]:
+    """The states along a leading axis."""
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], states) for k in range(n))
 
 
 def gpb2(names: tuple[str, ...], modes: tuple[Filter, ...], params: Params) -> Filter:
@@ -35,29 +47,35 @@ def gpb2(names: tuple[str, ...], modes: tuple[Filter, ...], params: Params) -> F
 
     def init(prior, key) -> Gpb2State:
         alone = jnp.where(jnp.eye(n, dtype=bool), jnp.log(params.start)[:, None], -jnp.inf)
-        return Gpb2State(alone, tuple((mode.init(prior, key),) * n for mode in modes))
+        return Gpb2State(alone, tuple(stacked([mode.init(prior, key)] * n) for mode in modes))
 
     def predict(state: Gpb2State, dt: Scalar, key) -> Gpb2State:
-        merged = [
-            merge_of(mode)(weights_of(state.log_probability[:, j]), state.pairs[j]) for j, mode in enumerate(modes)
-        ]
+        weights = [weights_of(state.log_probability[:, j]) for j in range(n)]
+        merged = stacked(
+            [
+                merge_of(mode)(weights[j], unstacked(history, n))
+                for j, (mode, history) in enumerate(zip(modes, state.histories, strict=True))
+            ]
+        )
         joint = logsumexp(state.log_probability, axis=0)[:, None] + log_transition
-        return Gpb2State(joint, tuple(tuple(mode.predict(old, dt, key) for old in merged) for mode in modes))
+        return Gpb2State(joint, tuple(jax.vmap(mode.predict, (0, None, None))(merged, dt, key) for mode in modes))
 
     def update(state: Gpb2State, scan: Measurements, key) -> tuple[Gpb2State, Info]:
-        results = [[m.update(s, scan, key) for s in row] for m, row in zip(modes, state.pairs, strict=True)]
-        log_likelihood = jnp.stack([jnp.stack([info.log_likelihood for _, info in row]) for row in results], axis=1)
-        joint = state.log_probability + log_likelihood
+        results = [
+            jax.vmap(mode.update, (0, None, None))(history, scan, key)
+            for mode, history in zip(modes, state.histories, strict=True)
+        ]
+        joint = state.log_probability + jnp.stack([info.log_likelihood for _, info in results], axis=1)
         total = logsumexp(joint)
         posterior = joint - total
-        infos = [row[i][1] for i in range(n) for row in results]  # in the order of the joint probabilities
-        pairs = tuple(tuple(new for new, _ in row) for row in results)
-        return Gpb2State(posterior, pairs), pooled(total, jnp.exp(posterior).ravel(), infos)
+        infos = [info for _, every in results for info in unstacked(every, n)]
+        new = Gpb2State(posterior, tuple(new for new, _ in results))
+        return new, pooled(total, jnp.exp(posterior).T.ravel(), infos)
 
     def estimate(state: Gpb2State) -> Estimate:
         merge, probability = merge_of(modes[0]), jnp.exp(logsumexp(state.log_probability, axis=0))
-        pairs = tuple(s for row in state.pairs for s in row)
-        merged = modes[0].estimate(merge(jnp.exp(state.log_probability).T.ravel(), pairs))
+        every = tuple(one for history in state.histories for one in unstacked(history, n))
+        merged = modes[0].estimate(merge(jnp.exp(state.log_probability).T.ravel(), every))
         return merged._replace(modes={name: probability[k] for k, name in enumerate(names)})
 
     return Filter(init, predict, update, estimate)

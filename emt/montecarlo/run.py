@@ -13,6 +13,7 @@ from emt.metrics.base import Ending, Metric, has
 from emt.metrics.iou import iou
 from emt.metrics.kinematic import position_error_squared
 from emt.montecarlo.fields import Fields, estimate_fields
+from emt.scans import of_each_run
 from emt.status import FAILURE, Status
 from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, State, StatePrior, Traced, Truth
 
@@ -163,7 +164,7 @@ def score(
 
     steps = jnp.arange(dt.shape[0])
     start = tracker.flt.init(tracker.prior, start_key(key))
-    carry = (start, jnp.asarray(0), jnp.asarray(-1, steps.dtype))
+    carry = of_each_run((start, jnp.asarray(0), jnp.asarray(-1, steps.dtype)), key)
     (state, status, failed), (rows, counts, track) = jax.lax.scan(step, carry, (steps, scans, dt, truth))
     last, last_truth = tracker.flt.estimate(state), jax.tree.map(lambda leaf: leaf[-1], truth)
     lost = jnp.asarray(False)

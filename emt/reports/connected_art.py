@@ -99,33 +99,41 @@ def draw_snapshots(
         ax.set_ylabel(with_unit("y", length_unit))
 
 
-def draw_step(ax: Axes, movie: Movie, styles: Mapping[str, LineStyle], step: int) -> None:
-    """True object, recent points and estimates at one step."""
-    for x, y, radius in movie.discs:
-        ax.add_patch(Circle((x, y), radius, fc=TRUTH_FILL, ec=TRUTH_EDGE, lw=0.6, zorder=1))
-    _draw_shape(ax, movie.truth, step, TRUTH_FILL, "-", 7.0, 1)
+def draw_step(ax: Axes, movie: Movie, styles: Mapping[str, LineStyle], step: int) -> list[Artist]:
+    """True object, recent points and estimates at one step; returns what was drawn."""
+    discs = [Circle((x, y), r, fc=TRUTH_FILL, ec=TRUTH_EDGE, lw=0.6, zorder=1) for x, y, r in movie.discs]
+    drawn: list[Artist] = [ax.add_patch(disc) for disc in discs]
+    drawn += _draw_shape(ax, movie.truth, step, TRUTH_FILL, "-", 7.0, 1)
     points = movie.points[max(step - RECENT + 1, 0) : step + 1].reshape(-1, 2)
-    ax.scatter(points[:, 0], points[:, 1], s=5.0, color=POINT, alpha=0.6, linewidths=0.0, zorder=3)
+    drawn.append(ax.scatter(points[:, 0], points[:, 1], s=5.0, color=POINT, alpha=0.6, linewidths=0.0, zorder=3))
     for label, (color, dashes) in styles.items():
-        _draw_shape(ax, movie.filters[label], step, color, dashes, 1.6, 4)
+        drawn += _draw_shape(ax, movie.filters[label], step, color, dashes, 1.6, 4)
+    set_window(ax, movie)
+    return drawn
+
+
+def set_window(ax: Axes, movie: Movie) -> None:
+    """The part of the plane that a movie needs."""
     left, right, bottom, top = movie.window
     ax.set_xlim(left, right)
     ax.set_ylim(bottom, top)
     ax.set_aspect("equal")
 
 
-def _draw_shape(ax: Axes, shape: Shape, step: int, color: str, dashes: Any, width: float, order: int) -> None:
+def _draw_shape(ax: Axes, shape: Shape, step: int, color: str, dashes: Any, width: float, order: int) -> list[Artist]:
     lines = LineCollection(
         list(shape.segments[step]), colors=color, linestyles=[dashes], linewidths=width, capstyle="round", zorder=order
     )
-    ax.add_collection(lines, autolim=False)
+    drawn: list[Artist] = [ax.add_collection(lines, autolim=False)]
     for x, y, a, b, direction, is_rectangle in shape.bodies[step]:
         look = {"fill": False, "ec": color, "ls": dashes, "lw": width, "zorder": order}
         turn = np.degrees(direction)
         if is_rectangle:
-            ax.add_patch(Rectangle((x - a, y - b), 2 * a, 2 * b, angle=turn, rotation_point="center", **look))
+            body = Rectangle((x - a, y - b), 2 * a, 2 * b, angle=turn, rotation_point="center", **look)
         else:
-            ax.add_patch(Ellipse((x, y), 2 * a, 2 * b, angle=turn, **look))
+            body = Ellipse((x, y), 2 * a, 2 * b, angle=turn, **look)
+        drawn.append(ax.add_patch(body))
+    return drawn
 
 
 def connected_legend(styles: Mapping[str, LineStyle]) -> tuple[list[Artist], list[str]]:
@@ -155,13 +163,20 @@ def animation(arrays: Mapping[str, np.ndarray], labels: Sequence[str], run_index
     figure = Figure(figsize=(FRAME_INCHES, FRAME_INCHES), dpi=FRAME_DPI)
     ax, canvas = figure.add_axes((0.09, 0.06, 0.89, 0.87)), FigureCanvasAgg(figure)
     ax.tick_params(labelsize=7.0)
+    heading = ax.set_title("", fontsize=8.0)
+    set_window(ax, movie)
+    canvas.draw()
+    empty = canvas.copy_from_bbox(figure.bbox)  # frame and ticks are the same for all steps, and take longest
     for step in steps:
-        ax.clear()
-        draw_step(ax, movie, styles, int(step))
-        ax.set_title(plain(f"{title}  scan {step + 1}".strip()), fontsize=8.0)
-        canvas.draw()
+        heading.set_text(plain(f"{title}  scan {step + 1}".strip()))
+        drawn = draw_step(ax, movie, styles, int(step))
+        canvas.restore_region(empty)
+        for artist in [*sorted(drawn, key=Artist.get_zorder), heading]:
+            ax.draw_artist(artist)
         frame = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
         frames.append(frame.quantize(24, dither=Image.Dither.NONE))
+        for artist in drawn:
+            artist.remove()
     buffer = io.BytesIO()
     frames[0].save(
         buffer, "gif", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0, optimize=True, disposal=1

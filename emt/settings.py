@@ -61,6 +61,12 @@ class Settings(BaseModel):
                 raise TypeError(f"{cls.__name__}.{name}: declare tuple[...], settings hold no lists or sets")
 
 
+def reads_points(settings: Settings) -> bool:
+    """Whether a filter of these settings reads the points of a scan; else count, mean and scatter are all it needs, and
+    its settings say so: `reads_points: ClassVar[bool] = False`."""
+    return getattr(settings, "reads_points", True)
+
+
 class PointSettings(Settings):
     """Settings of a filter of a point."""
 

@@ -9,7 +9,7 @@ from emt.filters.moment_ukf import MomentUkfSettings
 from emt.filters.unscented import Gaussian, merge_gaussians, product, square_root
 from emt.lanes import each, lanes_last, total
 from emt.linalg import once
-from emt.scans import as_scan, filled_slots, is_seen, prepared, scan_statistics, screen
+from emt.scans import as_scan, filled_slots, is_seen, of_each_run, prepared, scan_statistics, screen
 from tests.filters.cases import FAST_COMPILE
 from tests.filters.test_moments_and_modes import CT, CV, built, prior
 
@@ -163,3 +163,37 @@ def test_a_scan_is_prepared_once():
     np.testing.assert_array_equal(clean.statistics.mean.array(), [2.0, 0.0])
     assert bool(is_seen(clean))
     assert not bool(is_seen(prepared(as_scan(jnp.zeros((0, 2)), 2))))
+
+
+def test_what_each_run_has_of_its_own_is_what_all_share():
+    shared, own = {"mean": jnp.arange(3.0), "count": jnp.asarray(2)}, jnp.arange(float(RUNS))
+    assert jax.tree.all(jax.tree.map(np.array_equal, of_each_run(shared, own[0]), shared))
+    found = jax.vmap(lambda mine: of_each_run((shared, mine), mine), out_axes=0)(own)
+    for run in range(RUNS):
+        alone = jax.tree.map(lambda leaf, run=run: leaf[run], found)
+        assert jax.tree.all(jax.tree.map(np.array_equal, alone, (shared, own[run])))
+
+
+def test_a_loop_whose_start_is_each_runs_own_is_mapped_in_one_pass():
+    """JAX traces the body of a mapped loop once more for every pass in which it finds something to map."""
+    traced = []
+
+    @jax.custom_batching.custom_vmap
+    def seen(x):
+        return x
+
+    @seen.def_vmap
+    def _(axis_size, in_batched, x):
+        traced.append(in_batched)
+        return x, in_batched[0]
+
+    def passes(start_of) -> int:
+        def loop(own):
+            return jax.lax.scan(lambda carry, _: (seen(carry) + own, None), start_of(own), length=3)[0]
+
+        traced.clear()
+        np.testing.assert_allclose(jax.vmap(loop)(jnp.arange(4.0)), 3.0 * jnp.arange(4.0))
+        return len(traced)
+
+    assert passes(lambda own: of_each_run(jnp.zeros(()), own)) == 1
+    assert passes(lambda own: 0.0 * own) == 1

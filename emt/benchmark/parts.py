@@ -73,7 +73,12 @@ def timed_parts(program: Program, loaded: Loaded) -> tuple[dict[str, Callable[[]
         calls[part] = lambda: jax.block_until_ready(lowered[0](*arguments))
         return calls[part]()
 
-    simulation = add("simulation", program.simulator(), (program.world, seed, runs), engine.simulator_options)
+    simulation = add(
+        "simulation",
+        program.simulator(points=program.needs_points),
+        (program.world, seed, runs),
+        engine.simulator_options,
+    )
     for label in loaded.experiment.filters:
         arguments = (program.world, program.filter_params[label], seed, runs, simulation.scans, simulation.truth)
         add(f"{label}, filter only", bare.scorer(label), arguments)

@@ -94,7 +94,7 @@ def prepared(name: str, overrides: Sequence[str] = ()) -> Bench:
     engine = Engine(program, seed, n)
     engine.compile()
     arguments = (program.world, jnp.asarray(seed), jnp.arange(n))
-    simulator = program.simulator().lower(*arguments).compile(engine.simulator_options)
+    simulator = program.simulator(points=program.needs_points).lower(*arguments).compile(engine.simulator_options)
     simulation = jax.block_until_ready(simulator(*arguments))
     calls = {
         "simulation": lambda: jax.block_until_ready(simulator(*arguments)),

@@ -1,7 +1,7 @@
 """Random-matrix filter of Feldmann, Fränken and Koch."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import jax.numpy as jnp
 from jax.tree_util import register_dataclass
@@ -45,6 +45,7 @@ class FeldmannSettings(Settings):
     """Random matrix with sensor noise (Feldmann, Fränken and Koch 2011)."""
 
     kind: Literal["feldmann"] = "feldmann"
+    reads_points: ClassVar[bool] = False
     weight: PositiveFloat
     """Prior weight of the extent, in points (ν - 6 of an inverse Wishart)."""
     decay: Annotated[TimeConstant | WeightDecay | InverseWishartDecay, Field(discriminator="kind")]

@@ -11,7 +11,7 @@ from pydantic import Field
 from emt.filters.base import TrackingModel, innovation_info
 from emt.linalg import Mat2, Sym2, Vec2
 from emt.registry import FILTERS
-from emt.scans import ScanStatistics, scan_statistics
+from emt.scans import ScanStatistics, is_seen, scan_statistics
 from emt.settings import AccelerationDensity, Angle, PositiveFloat, Settings
 from emt.shapes.ellipse import extent_matrix
 from emt.types import Ellipse, Estimate, Filter, Info, Measurements, Prior, Scalar, Traced
@@ -24,6 +24,7 @@ class LanLiSettings(Settings):
     """Random matrix with rotation and agility (Lan and Li 2016)."""
 
     kind: Literal["lan_li"] = "lan_li"
+    reads_points: ClassVar[bool] = False
     degrees_of_freedom: float = Field(gt=8.0)
     """Of the prior inverse Wishart extent; its variance exists only above 8."""
     psd: AccelerationDensity
@@ -182,7 +183,7 @@ def lan_li(params: Params, model: TrackingModel) -> Filter:
         spread = model.extent_scale * state.extent + model.sensor_noise
         info: Info = innovation_info(state.position, state.kinematic.xx * state.extent, spread, scan)
         new, log_likelihood = update(state, scan_statistics(scan), model)
-        seen = scan.mask.any()
+        seen = is_seen(scan)
         return new, info._replace(log_likelihood=jnp.where(seen, log_likelihood, 0.0))
 
     def estimate(state: LanLiState) -> Estimate:

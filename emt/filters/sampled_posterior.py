@@ -1,7 +1,7 @@
 """The posterior of the elliptical model by Monte Carlo: a slow reference for single updates."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ class SampledPosteriorSettings(Settings):
     """
 
     kind: Literal["sampled_posterior"] = "sampled_posterior"
+    reads_points: ClassVar[bool] = False
     samples: Annotated[int, Field(ge=1_000, le=10_000_000)] = 1_000_000
     shape: tuple[ShapeParameter, ShapeParameter] = (10.0, 10.0)
     """Prior inverse-gamma shapes of the squared semi-axes."""

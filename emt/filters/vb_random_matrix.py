@@ -1,7 +1,7 @@
 """Variational-Bayes random matrix with explicit orientation."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ class VbRandomMatrixSettings(Settings):
     """Variational-Bayes random matrix with orientation (Tuncer and Özkan 2021)."""
 
     kind: Literal["vb_random_matrix"] = "vb_random_matrix"
+    reads_points: ClassVar[bool] = False
     iterations: PositiveInt = 10
     """Variational iterations per scan."""
     shape: tuple[ShapeParameter, ShapeParameter] = (10.0, 10.0)

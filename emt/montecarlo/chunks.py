@@ -94,6 +94,8 @@ def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, n
     return {name: np.asarray(value) for name, value in arrays.items()}
 
 
+SHOWN = "with points"
+"""Name, which no filter can have, of the simulator that keeps the points of scans."""
 COMPILATION: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 """Options of XLA for filters on CPUs: these compile twice as fast, and run as fast wherever `linalg.once` keeps the
 compiler from computing the same thing again and again. The simulator, compiled once, runs faster without."""
@@ -151,7 +153,7 @@ class Engine:
         if self._compiled:
             return
         program, runs = self.program, jnp.zeros(self.chunk_size * self.at_once, int)
-        simulator = program.simulator(self.devices)
+        simulator = program.simulator(self.devices, program.needs_points)
 
         def build(name: str):
             on_start(name or "scenario")
@@ -164,6 +166,15 @@ class Engine:
         with without_collection(), ThreadPoolExecutor(WORKERS) as pool:
             shapes = jax.eval_shape(simulator, program.world, self.seed, runs)
             self._compiled = dict(zip(names, pool.map(build, names), strict=True))
+
+    def with_points(self, runs: Array) -> Simulation:
+        """The same simulation with the points of scans, for a chunk whose runs are shown; compiled when it is first
+        asked for."""
+        arguments = self.program.world, self.seed, runs
+        if SHOWN not in self._compiled:
+            lowered = self.program.simulator(self.devices).lower(*arguments)
+            self._compiled[SHOWN] = lowered.compile(self.simulator_options)
+        return self._compiled[SHOWN](*arguments)
 
     def arguments(self, label: str, runs, scans, target) -> tuple[Any, ...]:
         """What the program of a filter is given."""
@@ -219,6 +230,8 @@ class Engine:
                 found[k] |= score_arrays(label, mine, stop - start)
                 if traced(k):
                     found[k] |= track_arrays(label, mine, traced(k))
+        if not program.needs_points and any(traced(k) for k in range(len(ranges))):
+            simulation = self.with_points(runs)
         for k in range(len(ranges)):
             if traced(k):
                 found[k] |= scan_arrays(program, part(simulation, k, RUNS_OF_SIMULATION), traced(k))

@@ -17,6 +17,7 @@ from emt.montecarlo.devices import over_runs
 from emt.montecarlo.run import Limits, Rules, Scores, Tracker, score
 from emt.montecarlo.world import drawn_prior, limits_of, model_of, prior_of
 from emt.registry import FILTERS, SCENARIOS
+from emt.settings import reads_points
 from emt.types import Articulated, Estimate, Info, Measurements, Point, Prior, Scenario, StatePrior, Truth
 
 
@@ -95,12 +96,24 @@ class Program:
             n_steps,
         )
 
-    def simulate_run(self, world: WorldParams, seed, run) -> Simulation:
-        """Truth and scans of one run."""
+    def simulate_run(self, world: WorldParams, seed, run, points: bool = True) -> Simulation:
+        """Truth and scans of one run.
+
+        Args:
+            points: whether scans hold their points; else only statistics, where the scenario gives them.
+        """
         scenario, key = self.make_scenario(world.scenario), run_key(seed, run)
         truth = scenario.sample_truth(purpose_key(key, Purpose.TRUTH))
         scans = scenario.sample_scans(truth, purpose_key(key, Purpose.MEASUREMENTS))
+        if not points and scans.statistics is not None:
+            scans = scans._replace(points=scans.points[:, :0], mask=scans.mask[:, :0])
         return Simulation(truth, scans)
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether anything reads the points of scans; if not, simulated scans hold statistics only, which take a tenth
+        of the memory."""
+        return self.experiment.traces or any(reads_points(filt) for filt in self.experiment.filters.values())
 
     def score_run(
         self, label: str, world, params, seed, run, scans: Measurements, target: Truth, number=None
@@ -172,9 +185,10 @@ class Program:
         having = [label for label in self.filter_params if label not in self.without(metric)]
         return metric.dof(self.told_by(having[0])[0]) if metric.dof is not None and having else 0
 
-    def simulator(self, devices: Sequence[Any] | None = None) -> Callable[..., Simulation]:
-        """Jitted (world, seed, runs) -> Simulation, mapped over runs."""
-        return over_runs(self.simulate_run, (None, None, 0), devices or jax.devices()[:1], RUNS_OF_SIMULATION)
+    def simulator(self, devices: Sequence[Any] | None = None, points: bool = True) -> Callable[..., Simulation]:
+        """Jitted (world, seed, runs) -> Simulation, mapped over runs; see `simulate_run` for `points`."""
+        simulate = partial(self.simulate_run, points=points)
+        return over_runs(simulate, (None, None, 0), devices or jax.devices()[:1], RUNS_OF_SIMULATION)
 
     def scorer(self, label: str) -> Callable[..., Scores]:
         """Jitted (world, params, seed, runs, scans, target) -> Scores of one filter, mapped over runs."""

@@ -10,6 +10,8 @@ import pytest
 import emt.filters.catalogue  # noqa: F401 - registers the filters
 from emt.linalg import Mat2
 from emt.registry import FILTERS
+from emt.scans import prepared
+from emt.settings import reads_points
 from emt.status import FAILURE, Status
 from emt.types import Ellipse, Measurements
 from tests.filters.cases import (
@@ -50,6 +52,18 @@ def test_agrees_with_its_oracle(case):
     for run in range(N_RUNS):
         theirs = case.oracle(case.settings, pick(problems(case), run))
         assert_same(case, Report(*(field[run] for field in ours)), theirs, case.tolerance)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if not reads_points(case.settings)], ids=str)
+def test_filters_of_statistics_need_no_points(case):
+    def bare(problem: Problem) -> Problem:
+        return problem._replace(scans=jax.vmap(without_points)(problem.scans))
+
+    def without_points(scan: Measurements) -> Measurements:
+        known = prepared(scan)
+        return known._replace(points=known.points[:0], mask=known.mask[:0])
+
+    assert_same(case, answer(case, jax.vmap(bare)(problems(case))), report(solved(case)[0]), 1e-12)
 
 
 @pytest.mark.slow

@@ -63,6 +63,16 @@ def test_one_more_filter_changes_no_other_filter():
 
 
 @pytest.mark.bits
+def test_without_their_points_scans_give_the_same_results():
+    """Filters of statistics are not given points, unless every report is asked for."""
+    lean, full = engine(), engine("traces=true")
+    assert (lean.program.needs_points, full.program.needs_points) == (False, True)
+    ours, theirs = lean.run_chunk(0, 16, tracked=1), full.run_chunk(0, 16)
+    np.testing.assert_array_equal(values(ours), values(theirs))
+    np.testing.assert_array_equal(ours["scans/points"], theirs["scans/points"][:1])
+
+
+@pytest.mark.bits
 def test_one_more_padding_slot_changes_no_detection_and_no_result():
     padded = engine("scenario.detections.max_points=25")
     ours, theirs = engine().run_chunk(0, 16, tracked=16), padded.run_chunk(0, 16, tracked=16)

@@ -74,10 +74,10 @@ def test_orderings_on_the_complex_trajectory():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("label", ["ukf_imm", "lan_li_imm"])
-def test_single_precision_agrees_within_monte_carlo_error(label):
+@pytest.mark.parametrize(("experiment", "label"), [("coordinated_turn", "ukf_ct"), ("complex", "lan_li_imm")])
+def test_single_precision_agrees_within_monte_carlo_error(experiment, label):
     for double, single in zip(
-        scores("complex", label), scores("complex", label, "monte_carlo.dtype=float32"), strict=True
+        scores(experiment, label), scores(experiment, label, "monte_carlo.dtype=float32"), strict=True
     ):
         assert single.failed == double.failed == 0
         assert abs(single.value - double.value) < 3.0 * double.error

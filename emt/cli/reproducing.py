@@ -1,6 +1,7 @@
 """`emt reproduce`: all experiments of the papers, as many at a time as there are processors."""
 
 import multiprocessing
+import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -101,10 +102,13 @@ def finished(jobs: list[Job], at_once: int) -> Iterator[str]:
 
     Tracing, compiling and drawing keep one processor busy each; experiments do not wait for one another.
     """
+    from emt.device import threads_of_each
+
     began, count = time.perf_counter(), len(jobs)
     at_once = min(at_once, max(count, 1))
     say(f"{count} experiments, {at_once} at a time; the first ones are compiling, which takes half a minute")
-    with ProcessPoolExecutor(at_once, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context, share = multiprocessing.get_context("spawn"), threads_of_each(at_once)
+    with ProcessPoolExecutor(at_once, mp_context=context, initializer=os.environ.update, initargs=(share,)) as pool:
         try:
             futures = [pool.submit(run_job, job) for job in spread(jobs)]
             for done, future in enumerate(as_completed(futures), start=1):

@@ -14,6 +14,7 @@ from multiprocessing import resource_tracker
 from typing import Any
 
 from emt.cluster.pool import ClusterError, Pool
+from emt.device import threads_of_each
 
 CONNECT_SECONDS = 10.0
 """A scheduler that has not answered by then is taken to be absent."""
@@ -87,6 +88,7 @@ def local_workers(n: int) -> Iterator[Any]:
                     n_workers=n,
                     threads_per_worker=1,
                     processes=True,
+                    env=threads_of_each(n),
                     memory_limit=0,  # results do not stay with workers, and a limit would only stop them
                     security=True,  # other users of the machine could have their code run otherwise
                     silence_logs=logging.CRITICAL + 1,

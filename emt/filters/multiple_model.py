@@ -71,9 +71,13 @@ class Bank(NamedTuple):
 
 def bank_start(model: StateSpaceModel, prior: Any) -> Bank:
     """All motions with the same prior."""
-    n_modes, n = len(model.motions), len(prior.mean)
-    means, covs = jnp.broadcast_to(prior.mean, (n_modes, n)), jnp.broadcast_to(prior.cov, (n_modes, n, n))
-    return Bank(model.start, Belief(means, covs), jnp.asarray(model.start_time, prior.mean.dtype))
+    beliefs = repeated(Belief(prior.mean, prior.cov), len(model.motions))
+    return Bank(model.start, beliefs, jnp.asarray(model.start_time, prior.mean.dtype))
+
+
+def repeated(belief: Belief, n: int) -> Belief:
+    """The same belief n times, along a new leading axis."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *leaf.shape)), belief)
 
 
 def bank_predicted(model: StateSpaceModel, beliefs: Belief, time: Scalar, dt: Scalar) -> Belief:
@@ -124,16 +128,16 @@ def multiple_model(model: StateSpaceModel, method: Method, floor: Scalar) -> Fil
     n_modes = len(model.motions)
 
     def predict(state: Bank, dt: Scalar, key) -> Bank:
-        eye = jnp.eye(n_modes, dtype=state.probability.dtype)
+        time, beliefs = state.time + dt, state.beliefs
         if method == "static":
             floored = jnp.maximum(state.probability, floor)
-            probability, weights = floored / floored.sum(), eye
+            probability = floored / floored.sum()
         else:
             probability, weights = mixing(state.probability, model.transition)
-        if method == "gpb1":
-            weights = jnp.broadcast_to(state.probability[:, None], eye.shape)
-        beliefs = state.beliefs if method == "static" else mixed(weights, state.beliefs)
-        time = state.time + dt
+            if method == "imm":
+                beliefs = mixed(weights, beliefs)
+            else:
+                beliefs = repeated(fused(state.probability, beliefs), n_modes)
         return Bank(probability, bank_predicted(model, beliefs, time, dt), time)
 
     def update(state: Bank, scan: Measurements, key):
@@ -180,15 +184,13 @@ def gpb2(model: StateSpaceModel) -> Filter:
     def init(prior, key) -> Pairs:
         bank = bank_start(model, prior)
         eye = jnp.eye(n_modes, dtype=bank.probability.dtype)
-        beliefs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n_modes, *leaf.shape)), bank.beliefs)
-        return Pairs(eye * bank.probability[:, None], beliefs, bank.time)
+        return Pairs(eye * bank.probability[:, None], repeated(bank.beliefs, n_modes), bank.time)
 
     def predict(state: Pairs, dt: Scalar, key) -> Pairs:
         bank, time = merged(state), state.time + dt
 
         def from_one(belief: Belief) -> Belief:
-            alike = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n_modes, *leaf.shape)), belief)
-            return bank_predicted(model, alike, time, dt)
+            return bank_predicted(model, repeated(belief, n_modes), time, dt)
 
         return Pairs(bank.probability[:, None] * model.transition, jax.vmap(from_one)(bank.beliefs), time)
 

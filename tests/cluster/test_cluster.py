@@ -14,6 +14,7 @@ import pytest
 from emt.cluster.connecting import open_pool
 from emt.cluster.pool import ClusterError
 from emt.config.load import load_experiment
+from emt.device import processors
 from emt.runner import run
 from tests.cli.run_emt import start_emt
 from tests.cli.test_interruption import results, wait_for_chunks
@@ -68,6 +69,12 @@ def test_two_workers_leave_the_same_bytes(alone, two, tmp_path):
     assert timing["runs"] == 400
     assert timing["microseconds_per_run_and_step"]["feldmann"] > 0
     assert timing["environments"] == [json.loads((tmp_path / "manifest.json").read_text())["environment"]]
+
+
+def test_workers_share_the_processors(two):
+    """Each starts its share of threads, while the process that `alone` is starts all of them: same bytes above."""
+    expected = os.environ.get("NPROC", str(max(1, processors() // 2)))
+    assert set(two._client.run(os.getenv, "NPROC").values()) == {expected}
 
 
 def test_a_figure_that_is_missing_is_drawn_by_a_worker(alone, two, tmp_path):

@@ -108,7 +108,7 @@ def finished(jobs: list[Job], at_once: int) -> Iterator[str]:
     at_once = min(at_once, max(count, 1))
     say(f"{count} experiments, {at_once} at a time; the first ones are compiling, which takes half a minute")
     context, share = multiprocessing.get_context("spawn"), threads_of_each(at_once)
-    with ProcessPoolExecutor(at_once, mp_context=context, initializer=os.environ.update, initargs=(share,)) as pool:
+    with ProcessPoolExecutor(at_once, mp_context=context, initializer=settle, initargs=(share,)) as pool:
         try:
             futures = [pool.submit(run_job, job) for job in spread(jobs)]
             for done, future in enumerate(as_completed(futures), start=1):
@@ -122,6 +122,11 @@ def finished(jobs: list[Job], at_once: int) -> Iterator[str]:
             raise InterruptedRunError(message) from None
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def settle(environment: dict[str, str]) -> None:
+    """Prepares a process for its jobs, before it loads JAX."""
+    os.environ.update(environment)
 
 
 def run_job(job: Job) -> tuple[str, str, str]:

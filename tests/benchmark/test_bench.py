@@ -163,6 +163,10 @@ def test_verdicts():
     assert len(found) == sum(goal.topic in ("vb", "start") for goal in GOALS)
     results["scaling"] = [{"runs": 1_000, "memory": 400.0}, {"runs": 1_000_000, "memory": 480.0}]
     assert verdicts(results)[-1]["reached"] is False
+    for scale, wall, reached in (("paper", 300.0, False), ("paper", 200.0, True), ("smoke", 200.0, None)):
+        results["reproduce"] = {"scale": scale, "wall": wall}
+        last = verdicts(results)[-1]
+        assert (last["goal"], last["reached"]) == ("emt reproduce at paper scale, on two cores", reached)
     results["workloads"]["vb"] = results["workloads"]["vb"] | {"rivals": []}
     table = goals_table(verdicts(results)).render("text")
     assert "not measured" in table

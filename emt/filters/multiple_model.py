@@ -134,10 +134,8 @@ def multiple_model(model: StateSpaceModel, method: Method, floor: Scalar) -> Fil
             probability = floored / floored.sum()
         else:
             probability, weights = mixing(state.probability, model.transition)
-            if method == "imm":
-                beliefs = mixed(weights, beliefs)
-            else:
-                beliefs = repeated(fused(state.probability, beliefs), n_modes)
+            alike = method == "gpb1"
+            beliefs = repeated(fused(state.probability, beliefs), n_modes) if alike else mixed(weights, beliefs)
         return Bank(probability, bank_predicted(model, beliefs, time, dt), time)
 
     def update(state: Bank, scan: Measurements, key):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from emt.linalg import Vec2
+from emt.logarithm import log_positive
 from emt.trigonometry import sincos_turns
 
 
@@ -38,7 +39,7 @@ def unit_disc(key: PRNGKeyArray, n: int, dtype) -> Vec2:
 
 def gaussian_radius(u):
     """Distance of a point of the standard Gaussian in the plane from a number uniform on (0, 1)."""
-    return jnp.sqrt(-2.0 * jnp.log(u))
+    return jnp.sqrt(-2.0 * log_positive(u))
 
 
 def normal_pairs(key: PRNGKeyArray, n: int, dtype) -> Vec2:

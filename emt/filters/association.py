@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from emt.linalg import Mat2, Sym2, Vec2, cholesky, once
+from emt.logarithm import log
 from emt.shapes.articulated import as_vec, semi_axes_of
 from emt.shapes.connected import Body, Connected
 from emt.shapes.linkage import disc_residual_moments, in_frames, length_of, segment_residual, turns_of
@@ -119,7 +120,7 @@ def evidence(
             )
             inverse, h = spread.inverse(), Vec2(center[x], center[y])
             pull, distance = inverse @ h, inverse.quadratic(h)
-            log_density = -0.5 * (distance + jnp.log(spread.det())) - jnp.log(jnp.asarray(2.0 * pi, dtype))
+            log_density = -0.5 * (distance + log(spread.det())) - jnp.log(jnp.asarray(2.0 * pi, dtype))
             shift = -(cross[x] * pull.x + cross[y] * pull.y)
             rows[component] = (log_density, distance, shift, cross[x], cross[y], *_entries(inverse), pull.x, pull.y)
         for j, body in enumerate(bodies, start=2 * len(segments)):
@@ -127,7 +128,7 @@ def evidence(
             pull = center[j] / variance
             distance = center[j] * pull
             area = jnp.asarray(4.0 if body.is_rectangle else pi, dtype)  # inside a level, per unit of it
-            log_density = -0.5 * (distance + jnp.log(2.0 * pi * variance)) - jnp.log(area)
+            log_density = -0.5 * (distance + log(2.0 * pi * variance)) - jnp.log(area)
             shift = -cross[j] * pull
             rows[body.component] = (
                 log_density,
@@ -155,7 +156,7 @@ def _disc(radius: float, at: tuple[float, float], dtype, point: Vec2, noise_cov:
     noise_variance = 0.5 * noise_cov.trace()
     center = Vec2(jnp.asarray(at[0], dtype), jnp.asarray(at[1], dtype))
     h, variance = disc_residual_moments(jnp.asarray(radius, dtype), center, noise_variance, point, rules.cross_term)
-    log_density = -0.5 * (h * h / variance + jnp.log(2.0 * pi * variance))
+    log_density = -0.5 * (h * h / variance + log(2.0 * pi * variance))
     return log_density + jnp.log(jnp.asarray(rules.disc_density_factor, dtype)), h * h / variance
 
 

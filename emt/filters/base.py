@@ -1,5 +1,6 @@
 """What filters share: the model they are told, their diagnostics, and the guard of their states."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Int
 
 from emt.linalg import Sym2, Vec2, all_finite, is_positive_definite
+from emt.logarithm import log
 from emt.models.motion import MotionNoise
 from emt.scans import all_of_batch, is_seen, scan_statistics, screen
 from emt.status import Status
@@ -50,11 +52,11 @@ def innovation_info(position: Vec2, position_cov: Sym2, spread: Sym2, scan: Meas
     innovation_cov = position_cov + (1.0 / count) * spread
     nis = innovation_cov.inverse().quadratic(stats.mean - position)
     log_likelihood = (
-        -0.5 * (nis + jnp.log(innovation_cov.det()))
-        - 0.5 * (count - 1.0) * jnp.log(spread.det())
+        -0.5 * (nis + log(innovation_cov.det()))
+        - 0.5 * (count - 1.0) * log(spread.det())
         - 0.5 * spread.inverse().inner(stats.scatter)
-        - count * jnp.log(2.0 * jnp.pi)
-        - jnp.log(count)
+        - count * math.log(2.0 * math.pi)
+        - log(count)
     )
     # the sum over the points of their squared distances from the prediction; 2 is expected of each
     weight = (position_cov + spread).inverse()

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from emt.lanes import lanes_last, total
 from emt.linalg import cholesky, forward_solve, once
+from emt.logarithm import log
 from emt.models.state_space.measurements import Measurement
 from emt.models.state_space.motions import Motion
 from emt.types import Scalar
@@ -113,7 +114,7 @@ def conditioned(
     m, root = innovation.shape[0], cholesky(innovation_cov)
     gain, white = forward_solve(root, cross.swapaxes(0, 1)), forward_solve(root, innovation)
     nis = total(white * white)
-    log_volume = sum(jnp.log(root[i, i]) for i in range(m))
+    log_volume = sum(log(root[i, i]) for i in range(m))
     log_likelihood = -0.5 * (nis + m * math.log(2.0 * math.pi)) - log_volume
     mean, taken = belief.mean + total(gain * white[:, None]), total(gain[:, :, None] * gain[:, None, :])
     return Belief(mean, belief.cov - taken), Innovation(log_likelihood, nis)

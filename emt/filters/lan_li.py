@@ -1,5 +1,6 @@
 """Random matrix with a rotation and an agility of the extent, after Lan and Li."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -10,6 +11,7 @@ from pydantic import Field
 
 from emt.filters.base import TrackingModel, innovation_info
 from emt.linalg import Mat2, Sym2, Vec2
+from emt.logarithm import log
 from emt.registry import FILTERS
 from emt.scans import ScanStatistics, is_seen, scan_statistics
 from emt.settings import AccelerationDensity, Angle, PositiveFloat, Settings
@@ -106,14 +108,14 @@ def update(state: LanLiState, stats: ScanStatistics, model: TrackingModel) -> tu
 
     before, after = 0.5 * (state.freedom + 3.0), 0.5 * (freedom + 3.0)
     log_likelihood = (
-        -n * jnp.log(jnp.pi)
-        - jnp.log(n)
-        - jnp.log(variance)
-        - (n - 1.0) * jnp.log(det)
+        -n * math.log(math.pi)
+        - log(n)
+        - log(variance)
+        - (n - 1.0) * log(det)
         + log_gamma(after)
         - log_gamma(before)
-        + before * jnp.log((state.freedom * state.extent).det())
-        - after * jnp.log(total.det())
+        + before * log((state.freedom * state.extent).det())
+        - after * log(total.det())
     )
     return new, log_likelihood
 

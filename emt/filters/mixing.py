@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from emt.logarithm import log
 from emt.types import Scalar
 
 
@@ -39,5 +40,5 @@ def posterior(
     joint = jnp.where(possible, predicted * relative, 0.0)
     total = joint.sum()
     sound = total > 0.0
-    log_total = largest + jnp.log(jnp.where(sound, total, 1.0))
+    log_total = largest + log(jnp.where(sound, total, 1.0))
     return jnp.where(sound, joint / jnp.where(sound, total, 1.0), predicted), log_total

@@ -18,6 +18,7 @@ from emt.filters.moment_update import Projection, augmented_update, expected, mo
 from emt.filters.unscented import Gaussian, Spread, merge_gaussians, product, square_root
 from emt.lanes import PerRun, lanes_last, total
 from emt.linalg import Sym2, Vec2
+from emt.logarithm import log
 from emt.models.turn import coordinated_turn
 from emt.registry import FILTERS
 from emt.settings import (
@@ -188,7 +189,7 @@ def log_likelihood(belief: Gaussian, points, mask, noise: Sym2, params: Params) 
 
     def body(j, before):
         now = expected(belief, Vec2(points[j, 0], points[j, 1]), noise, params.spread, params.projection)
-        one = -0.5 * (now.mean * now.mean / now.variance + jnp.log(2.0 * jnp.pi * now.variance))
+        one = -0.5 * (now.mean * now.mean / now.variance + log(2.0 * jnp.pi * now.variance))
         return before + jnp.where(mask[j], one, 0.0)
 
     return jax.lax.fori_loop(0, last_of(mask), body, jnp.zeros(mask.shape[1:], points.dtype))

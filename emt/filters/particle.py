@@ -20,6 +20,7 @@ from emt.filters.state_space import info_of, motion_faults, reading, report
 from emt.filters.ukf import PointRule, UnscentedSettings, spread_faults, ukf_kernel
 from emt.filters.unscented import Spread
 from emt.linalg import cholesky, semidefinite_root
+from emt.logarithm import log
 from emt.matrices import Matrix, SquareMatrix, check_square
 from emt.models.state_space.model import StateSpaceModel
 from emt.models.state_space.motions import gaussian_log_density
@@ -210,7 +211,7 @@ def particle(
         roots = jax.vmap(cholesky)(beliefs.cov)
         draw = normals(key, state.particles.shape, state.particles.dtype)
         particles = beliefs.mean + (roots * draw[:, None, :]).sum(axis=2)
-        scale = jnp.log(jnp.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+        scale = log(jnp.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
         log_proposal = -0.5 * (draw * draw + jnp.log(2.0 * jnp.pi)).sum(axis=1) - scale
         log_motion = jax.vmap(lambda v: motion.log_density(v, own.dt))(particles - own.centers)
         gains = log_likelihood(particles, value, state.time) + log_motion - log_proposal

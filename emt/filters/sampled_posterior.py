@@ -13,6 +13,7 @@ from emt.filters import kinematics
 from emt.filters import vb_random_matrix as vb
 from emt.filters.base import TrackingModel, innovation_info
 from emt.linalg import Sym2, Vec2, parallel
+from emt.logarithm import log
 from emt.registry import FILTERS
 from emt.scans import ScanStatistics, scan_statistics
 from emt.settings import PositiveAngleVariance, Settings, ShapeParameter
@@ -72,7 +73,7 @@ def weighted_gamma(normal: Float[Array, "n"], shape: Scalar) -> tuple[Float[Arra
     v = (1.0 + normal / jnp.sqrt(9.0 * d)) ** 3
     positive = v > 0.0
     v = jnp.where(positive, v, 1.0)
-    log_ratio = 0.5 * normal * normal + d - d * v + d * jnp.log(v)
+    log_ratio = 0.5 * normal * normal + d - d * v + d * log(v)
     return d * v, jnp.where(positive, log_ratio, -jnp.inf)
 
 
@@ -99,8 +100,8 @@ def draw(state: vb.VbState, stats: ScanStatistics, model: TrackingModel, key, n:
         weight = innovation_cov.inverse()
         log_weight = -0.5 * (
             weight.quadratic(innovation)
-            + jnp.log(innovation_cov.det())
-            + (m - 1.0) * jnp.log(spread.det())
+            + log(innovation_cov.det())
+            + (m - 1.0) * log(spread.det())
             + spread.inverse().inner(stats.scatter)
         )
         position = belief.position + belief.position_cov @ (weight @ innovation)

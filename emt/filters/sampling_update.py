@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from emt.logarithm import log
 from emt.types import Scalar
 
 
@@ -59,10 +60,10 @@ def sampled_moments(
 def inverse_and_log_det(cov: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Scalar]:
     """Inverse and log determinant of a covariance of one or two components, in closed form."""
     if cov.shape[0] == 1:
-        return 1.0 / cov, jnp.log(cov[0, 0])
+        return 1.0 / cov, log(cov[0, 0])
     det = cov[0, 0] * cov[1, 1] - cov[0, 1] * cov[1, 0]
     adjugate = jnp.stack([jnp.stack([cov[1, 1], -cov[0, 1]]), jnp.stack([-cov[1, 0], cov[0, 0]])])
-    return adjugate / det, jnp.log(det)
+    return adjugate / det, log(det)
 
 
 def conditioned(mean: Float[Array, "n"], cov: Float[Array, "n n"], h: Moments) -> Updated:

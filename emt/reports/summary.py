@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from emt.reports.gathering import (
     FilterResults,
@@ -79,7 +79,7 @@ def band(dof: int, runs: int) -> tuple[float, float]:
 
     Source: Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
     """
-    low, high = chi2.ppf([0.025, 0.975], dof * runs) / runs
+    low, high = 2.0 * gammaincinv(0.5 * dof * runs, [0.025, 0.975]) / runs
     return float(low), float(high)
 
 

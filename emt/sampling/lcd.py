@@ -11,7 +11,6 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import expi
 
 RESTARTS = 8
@@ -91,6 +90,8 @@ def symmetric_set(dimension: int, count: int, seed: int = 0, restarts: int = RES
     Raises:
         ValueError: fewer points than twice the dimension cannot have covariance I.
     """
+    from scipy.optimize import minimize  # takes a while to load, and sets are computed once
+
     if count < 2 * dimension:
         raise ValueError(f"{count} samples are too few for dimension {dimension}: at least {2 * dimension} are needed")
     free = count // 2

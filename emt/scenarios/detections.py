@@ -10,7 +10,7 @@ import numpy as np
 from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from pydantic import Field, NonNegativeInt, PositiveInt
-from scipy.stats import poisson
+from scipy.special import pdtrc
 
 from emt.draws import normal_pairs, uniform_pairs, unit_disc
 from emt.keys import step_key
@@ -75,17 +75,20 @@ def capacity_for(settings: DetectionSettings, n_steps: int, runs: int) -> int:
     if isinstance(settings.count, FixedCount):
         return max(settings.count.count, 1)
     per_scan = OVERFLOW_PROBABILITY / (n_steps * max(runs, LARGEST_EXPERIMENT))
-    candidates = np.arange(1, int(settings.count.mean + 40.0 * math.sqrt(settings.count.mean) + 100.0))
-    # the survival function itself: its inverse is not accurate this far out
-    enough = candidates[poisson.sf(candidates, settings.count.mean) < per_scan]
-    return -(-max(int(enough[0]), settings.count.minimum) // VECTOR) * VECTOR
+    return -(-max(rarely_exceeded(settings.count.mean, per_scan), settings.count.minimum) // VECTOR) * VECTOR
+
+
+def rarely_exceeded(mean: float, probability: float) -> int:
+    """The least number from 1 on that a Poisson number exceeds with less than this probability, which may be tiny."""
+    candidates = np.arange(1, int(mean + 40.0 * math.sqrt(mean) + 100.0))
+    return int(candidates[pdtrc(candidates, mean) < probability][0])
 
 
 def usual_slots(settings: DetectionSettings, capacity: int) -> int:
     """Slots that are enough for all but one scan in ten thousand: those beyond are drawn only where they are needed."""
     if isinstance(settings.count, FixedCount):
         return capacity
-    enough = max(int(poisson.isf(1e-4, settings.count.mean)), settings.count.minimum)
+    enough = max(rarely_exceeded(settings.count.mean, 1e-4), settings.count.minimum)
     return min(-(-enough // VECTOR) * VECTOR, capacity)
 
 

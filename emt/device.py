@@ -27,15 +27,29 @@ def configure() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+CPUINFO = Path("/proc/cpuinfo")
+VECTORS = ("avx512f", "avx2", "avx", "asimd")
+"""Vector instructions as Linux names them, the widest first."""
+
+
 def cpu_name() -> str:
-    """Model of the processor, as far as the system tells."""
+    """Model of the processor, as far as the system tells.
+
+    Virtual machines often name a family of processors only, so its numbers and vector instructions are told as well:
+    compiled programs differ between them in rounding.
+    """
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        lines = CPUINFO.read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor()
-    return next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor()
-    )
+    told: dict[str, str] = {}
+    for line in lines:
+        key, _, value = line.partition(":")
+        told.setdefault(key.strip(), value.strip())  # of the first processor
+    flags = (told.get("flags") or told.get("Features") or "").split()
+    numbers = [f"{key.removeprefix('cpu ')} {told[key]}" for key in ("cpu family", "model") if key in told]
+    widest = [name for name in VECTORS if name in flags][:1]
+    return ", ".join([told.get("model name") or platform.processor() or platform.machine(), *numbers, *widest])
 
 
 def processors() -> int:

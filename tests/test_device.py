@@ -17,3 +17,25 @@ def test_processes_share_the_processors(monkeypatch, processors, processes, thre
 def test_what_the_user_set_stays(monkeypatch):
     monkeypatch.setenv("NPROC", "7")
     assert device.threads_of_each(2) == {}
+
+
+def test_processors_of_one_name_are_told_apart(monkeypatch, tmp_path):
+    """Virtual machines name a family; what a program is compiled for is in the numbers and instructions."""
+    monkeypatch.setattr(device, "CPUINFO", tmp_path / "cpuinfo")
+    names = set()
+    for model, flags in (("1", "fpu avx avx2"), ("17", "fpu avx avx2 avx512f"), ("17", "fpu avx avx2")):
+        block = f"processor\t: 0\ncpu family\t: 25\nmodel\t\t: {model}\nmodel name\t: AMD EPYC\nflags\t\t: {flags}\n\n"
+        device.CPUINFO.write_text(block + block.replace("avx2", ""))
+        names.add(device.cpu_name())
+    assert names == {
+        "AMD EPYC, family 25, model 1, avx2",
+        "AMD EPYC, family 25, model 17, avx512f",
+        "AMD EPYC, family 25, model 17, avx2",
+    }
+
+
+def test_a_system_that_tells_nothing_still_has_a_name(monkeypatch, tmp_path):
+    monkeypatch.setattr(device, "CPUINFO", tmp_path / "none")
+    assert isinstance(device.cpu_name(), str)
+    (tmp_path / "none").write_text("Features : fp asimd\n")
+    assert device.cpu_name().endswith(", asimd")

@@ -57,6 +57,12 @@ def processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def threads() -> int:
+    """Threads among which XLA shares its work here: one per processor, unless the environment variable NPROC says."""
+    told = os.environ.get("NPROC", "")
+    return max(1, int(told)) if told.isdigit() else processors()
+
+
 def threads_of_each(processes: int) -> dict[str, str]:
     """Environment for one of several processes that work side by side: XLA starts this process's share of threads.
 

@@ -14,6 +14,15 @@ def test_processes_share_the_processors(monkeypatch, processors, processes, thre
     assert device.threads_of_each(processes) == {"NPROC": threads}
 
 
+def test_threads_are_those_told_or_one_per_processor(monkeypatch):
+    monkeypatch.setattr(device, "processors", lambda: 6)
+    for told, threads in (("1", 1), ("4", 4), ("0", 1), ("many", 6), ("", 6)):
+        monkeypatch.setenv("NPROC", told)
+        assert device.threads() == threads
+    monkeypatch.delenv("NPROC")
+    assert device.threads() == 6
+
+
 def test_what_the_user_set_stays(monkeypatch):
     monkeypatch.setenv("NPROC", "7")
     assert device.threads_of_each(2) == {}

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from emt.device import threads
 from emt.keys import filter_number
 from emt.models.state_space.measurements import Measurement
 from emt.montecarlo.devices import chunks_at_once
@@ -25,7 +26,8 @@ from emt.status import FAILURE
 from emt.types import Measurements
 
 WORKERS = 2
-"""Chunks in work at a time."""
+"""Programs compiled at a time, and chunks in work where XLA has a thread for each: on one they would only wait for one
+another, and what a filter costs could not be told."""
 BLOCKS = 8
 """Groups of runs per chunk whose sums per step are kept apart, for standard errors of root-mean-square metrics."""
 
@@ -188,7 +190,8 @@ class Engine:
         """Microseconds per run and step of each filter with its metrics: the median over chunks but the first, which is
         slower than the others, if there are any.
 
-        Two chunks are in work at a time, so it is what a run costs in company, not alone.
+        Two chunks are in work at a time where there are threads for both, so it is what a run costs in company, not
+        alone.
         """
         lanes = self.chunk_size * self.program.n_steps
         later = {label: found[1:] or found for label, found in self.seconds.items() if found}
@@ -241,14 +244,14 @@ class Engine:
         return found
 
     def run_chunks(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
-        """(start, stop, arrays) of several chunks in order, two calls of them in work at a time; run 0 comes with
-        tracks.
+        """(start, stop, arrays) of several chunks in order, two calls of them in work at a time if there are threads
+        for both; run 0 comes with tracks.
 
         Two chunks on two cores take less time than each of them spread over both.
         """
-        remaining = iter(ranges)
+        remaining, at_a_time = iter(ranges), min(WORKERS, threads())
         groups = iter(lambda: list(itertools.islice(remaining, self.at_once)), [])
-        with ThreadPoolExecutor(WORKERS) as pool:
+        with ThreadPoolExecutor(at_a_time) as pool:
             waiting: deque = deque()
 
             def first() -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
@@ -259,7 +262,7 @@ class Engine:
             try:
                 for group in groups:
                     waiting.append((group, pool.submit(self.run_group, group, tracked=int(group[0][0] == 0))))
-                    if len(waiting) > WORKERS:
+                    if len(waiting) > at_a_time:
                         yield from first()
                 while waiting:
                     yield from first()

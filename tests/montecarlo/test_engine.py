@@ -1,5 +1,7 @@
 """A run is the same alone, in any chunk, in any company."""
 
+import threading
+import time
 from copy import copy
 from functools import cache
 from pathlib import Path
@@ -147,3 +149,27 @@ def test_chunks_are_padded_with_their_last_run(start, stop):
     assert len(runs) == 16
     assert list(runs[: stop - start]) == list(range(start, stop))
     assert set(runs[stop - start :]) <= {stop - 1}
+
+
+@pytest.mark.parametrize(("told", "most"), [("1", 1), ("2", 2), ("8", 2)])
+def test_chunks_are_in_work_together_only_if_there_are_threads_for_them(monkeypatch, told, most):
+    """What a filter costs is a wall-clock time: on one thread it would hold the work of the other chunk."""
+    monkeypatch.setenv("NPROC", told)
+    engine, lock, now, seen = Engine.__new__(Engine), threading.Lock(), [0], []
+    engine.at_once = 1
+
+    def run_group(ranges, *, tracked):
+        with lock:
+            now[0] += 1
+            seen.append(now[0])
+        time.sleep(0.05)
+        with lock:
+            now[0] -= 1
+        return [{"tracked": np.array(tracked)}]
+
+    monkeypatch.setattr(engine, "run_group", run_group)
+    ranges = [(10 * k, 10 * k + 10) for k in range(6)]
+    found = list(engine.run_chunks(ranges))
+    assert [(start, stop) for start, stop, _ in found] == ranges
+    assert [int(arrays["tracked"]) for *_, arrays in found] == [1, 0, 0, 0, 0, 0]
+    assert max(seen) == most

@@ -101,16 +101,18 @@ def run_shown(
 ):
     """Runs an experiment under a live view; an interruption becomes a message that says how to go on."""
     from emt.cli.display import LiveView
+    from emt.cli.interruption import remembered
     from emt.runner import run as run_experiment
 
     metric = loaded.experiment.metrics[0] if loaded.experiment.metrics else ""
     last = None
     try:
-        with LiveView(loaded.name, metric) as view:
+        with remembered() as look, LiveView(loaded.name, metric) as view:
 
             def update(progress):
                 nonlocal last
                 last = progress
+                look()
                 view.update(progress)
 
             options = {"figures": figures, "quick": quick, "on_progress": update, "pool": pool}

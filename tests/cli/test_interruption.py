@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from emt.cli.interruption import remembered
 from tests.cli.run_emt import start_emt
 from tests.montecarlo.small import TEXT, write
 
@@ -75,3 +76,31 @@ def test_a_second_process_in_the_same_folder_is_refused(tmp_path, undisturbed):
         assert str(first.pid) in err
     first.communicate(timeout=300)
     assert first.returncode == 0
+
+
+class EndsWithCtrlC:
+    """Is finalised at the moment when the user presses Ctrl-C."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interruption_that_python_drops_is_remembered():
+    with remembered() as look:
+        look()
+        EndsWithCtrlC()  # prints that KeyboardInterrupt is ignored
+        with pytest.raises(KeyboardInterrupt):
+            look()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_that_does_something_else_is_left_alone():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with remembered() as look:
+            signal.raise_signal(signal.SIGINT)
+            look()
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

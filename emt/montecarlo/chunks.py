@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from emt.device import threads
 from emt.keys import filter_number
 from emt.models.state_space.measurements import Measurement
+from emt.montecarlo.compiling import filter_options, simulator_options
 from emt.montecarlo.devices import chunks_at_once
 from emt.montecarlo.fields import truth_fields
 from emt.montecarlo.program import RUNS_OF_SIMULATION, Program, Simulation
@@ -98,14 +99,6 @@ def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, n
 
 SHOWN = "with points"
 """Name, which no filter can have, of the simulator that keeps the points of scans."""
-OWN_SUMS: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"}
-"""Options of XLA on CPUs for every program: its library computes products of matrices, not sums. Those of the library
-are slower for few numbers, and their rounding depends on the number of threads."""
-COMPILATION: dict[str, Any] = OWN_SUMS | {"xla_cpu_use_fusion_emitters": False}
-"""Options for filters: these compile twice as fast, and run as fast wherever `linalg.once` keeps the compiler from
-computing the same thing again and again. The simulator, compiled once, runs faster without."""
-QUICK_COMPILATION: dict[str, Any] = COMPILATION | {"xla_backend_optimization_level": 0}
-"""Options for programs that run once on few runs: compiling takes longer than running. Results differ in rounding."""
 
 
 @contextmanager
@@ -140,10 +133,7 @@ class Engine:
         self.program, self.seed, self.chunk_size = program, jnp.asarray(seed), chunk_size
         self.devices = list(devices or jax.local_devices())
         self.at_once = chunks_at_once(chunk_size, self.devices)
-        on_cpu = jax.default_backend() == "cpu"
-        self.options = (QUICK_COMPILATION if quick else COMPILATION) if on_cpu else None
-        """Options of XLA for filters."""
-        self.simulator_options = (QUICK_COMPILATION if quick else OWN_SUMS) if on_cpu else None
+        self.options, self.simulator_options = filter_options(quick=quick), simulator_options(quick=quick)
         self._compiled: dict[str, Any] = {}
         self.seconds: dict[str, list[float]] = {label: [] for label in program.filter_params}
         """Wall-clock time of filter and metrics of each chunk so far, by filter."""

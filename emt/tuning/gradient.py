@@ -10,6 +10,7 @@ import numpy as np
 import optax
 
 from emt.config.load import Loaded
+from emt.montecarlo.compiling import filter_options
 from emt.tuning.parameters import Parameter, candidate
 from emt.tuning.scoring import Batch, Data
 from emt.tuning.trial import Built, Trial, build_trial
@@ -44,7 +45,7 @@ class Descent:
     def __init__(self, batch: Batch, loaded: Loaded, parameters: Sequence[Parameter]):
         self.batch, self.loaded, self.parameters = batch, loaded, parameters
         self.built = build_trial(loaded.experiment, batch.label)
-        self._compiled = jax.jit(self._slopes)
+        self._compiled = jax.jit(self._slopes, compiler_options=filter_options())
 
     def trial(self, theta: np.ndarray) -> Built:
         """The candidate at these coordinates."""

@@ -14,6 +14,7 @@ import numpy as np
 from emt.config.load import Loaded
 from emt.metrics.base import Metric
 from emt.montecarlo.chunks import WORKERS
+from emt.montecarlo.compiling import filter_options, simulator_options
 from emt.montecarlo.program import RUNS_OF_SIMULATION, SCORED
 from emt.montecarlo.run import as_truth
 from emt.runner import build_program
@@ -100,10 +101,12 @@ class Batch:
         self.program = dataclasses.replace(build_program(loaded), metrics=self.metrics)
         program, reference = self.program, loaded.experiment.reference
         seed, runs = jnp.asarray(loaded.experiment.monte_carlo.seed), first + jnp.arange(count)
-        simulation = program.simulator()(program.world, seed, runs)
+        simulate = program.simulator().lower(program.world, seed, runs).compile(simulator_options())
+        simulation = simulate(program.world, seed, runs)
         self.data = Data(seed, runs, simulation.scans, simulation.truth)
         if reference != "truth":
-            scores = program.scorer(reference)(program.world, program.filter_params[reference], *self.data)
+            arguments = (program.world, program.filter_params[reference], *self.data)
+            scores = program.scorer(reference).lower(*arguments).compile(filter_options())(*arguments)
             self.data = self.data._replace(target=jax.vmap(as_truth, out_axes=RUNS_OF_SIMULATION)(scores.track))
 
     def shares(self, make: Callable[..., Any], trial: Trial, data: Data) -> tuple[jax.Array, jax.Array]:
@@ -125,7 +128,8 @@ class Batch:
         done = 0
         for group in grouped(list(trials)):
             together = max(1, min(LANES // len(self.data.runs), len(group)))
-            compiled = jax.jit(jax.vmap(partial(self.shares, trials[group[0]].make), in_axes=(0, None)))
+            of_all = jax.vmap(partial(self.shares, trials[group[0]].make), in_axes=(0, None))
+            compiled = jax.jit(of_all, compiler_options=filter_options())
 
             def one(members: list[int], compiled=compiled, together=together):
                 padded = members + [members[-1]] * (together - len(members))

@@ -13,7 +13,7 @@ from emt.benchmark.peers.given import scans_of
 from emt.benchmark.plain import FORMS
 from emt.config.experiment import Experiment
 from emt.config.load import load_experiment
-from emt.montecarlo.chunks import QUICK_COMPILATION
+from emt.montecarlo.compiling import QUICK_COMPILATION
 from emt.montecarlo.program import Program
 from tests.reference import moment_square_root
 from tests.reference.workloads import REFERENCES

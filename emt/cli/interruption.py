@@ -10,8 +10,8 @@ from contextlib import contextmanager
 def remembered() -> Iterator[Callable[[], None]]:
     """Gives a function to call now and then: it raises KeyboardInterrupt if the user asked for the end, once more.
 
-    Python raises it wherever the main thread is, and drops whatever is raised while an object is finalised; Dask's
-    futures are so all the time. Where Ctrl-C does something else, or this is not the main thread, nothing changes.
+    Python raises it wherever the main thread is, and drops whatever is raised while an object is finalised, as a future
+    of Dask is for every chunk. Where Ctrl-C does something else, or this is not the main thread, nothing changes.
     """
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:

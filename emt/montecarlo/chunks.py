@@ -134,6 +134,7 @@ class Engine:
         self.devices = list(devices or jax.local_devices())
         self.at_once = chunks_at_once(chunk_size, self.devices)
         self.options, self.simulator_options = filter_options(quick=quick), simulator_options(quick=quick)
+        """Options of XLA for filters, and for the simulator."""
         self._compiled: dict[str, Any] = {}
         self.seconds: dict[str, list[float]] = {label: [] for label in program.filter_params}
         """Wall-clock time of filter and metrics of each chunk so far, by filter."""

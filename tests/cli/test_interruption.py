@@ -6,7 +6,11 @@ import time
 
 import pytest
 
+from emt.cli.errors import InterruptedRunError
 from emt.cli.interruption import remembered
+from emt.cli.running import run_shown
+from emt.config.load import load_experiment
+from emt.runner import Progress
 from tests.cli.run_emt import start_emt
 from tests.montecarlo.small import TEXT, write
 
@@ -92,6 +96,17 @@ def test_an_interruption_that_python_drops_is_remembered():
         with pytest.raises(KeyboardInterrupt):
             look()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_run_whose_interruption_python_drops_ends_at_the_next_chunk(tmp_path, monkeypatch):
+    def run(loaded, folder, *, on_progress, **options):
+        EndsWithCtrlC()
+        on_progress(Progress("running", "chunk 1/2", 16, 32, 1.0, {}))
+
+    monkeypatch.setattr("emt.runner.run", run)
+    with pytest.raises(InterruptedRunError, match="16 of 32 runs are kept"):
+        run_shown(load_experiment(str(write(tmp_path))), tmp_path)
 
 
 def test_ctrl_c_that_does_something_else_is_left_alone():

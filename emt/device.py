@@ -32,23 +32,34 @@ VECTORS = ("avx512f", "avx2", "avx", "asimd")
 """Vector instructions as Linux names them, the widest first."""
 
 
+def cpu_facts() -> dict[str, str]:
+    """What Linux tells of the first processor, by its own keys; nothing elsewhere."""
+    try:
+        lines = CPUINFO.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return {}
+    told: dict[str, str] = {}
+    for line in lines:
+        key, _, value = line.partition(":")
+        told.setdefault(key.strip(), value.strip())
+    return told
+
+
+def widest_vectors(told: dict[str, str]) -> str | None:
+    """The widest of `VECTORS` that a processor has; None if it has or tells none."""
+    flags = (told.get("flags") or told.get("Features") or "").split()
+    return next((name for name in VECTORS if name in flags), None)
+
+
 def cpu_name() -> str:
     """Model of the processor, as far as the system tells.
 
     Virtual machines often name a family of processors only, so its numbers and vector instructions are told as well:
     compiled programs differ between them in rounding.
     """
-    try:
-        lines = CPUINFO.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    told: dict[str, str] = {}
-    for line in lines:
-        key, _, value = line.partition(":")
-        told.setdefault(key.strip(), value.strip())  # of the first processor
-    flags = (told.get("flags") or told.get("Features") or "").split()
+    told = cpu_facts()
     numbers = [f"{key.removeprefix('cpu ')} {told[key]}" for key in ("cpu family", "model") if key in told]
-    widest = [name for name in VECTORS if name in flags][:1]
+    widest = [name] if (name := widest_vectors(told)) else []
     return ", ".join([told.get("model name") or platform.processor() or platform.machine(), *numbers, *widest])
 
 

@@ -13,7 +13,7 @@ PerRun = Float[Array, "*lanes"]
 """A number of a run: of shape () where a step of one run is written down, of many runs where it is mapped."""
 
 
-def lanes_last(function: Mapped) -> Mapped:
+def lanes_last(function: Mapped, *, common: int = 0) -> Mapped:
     """The function, which `vmap` maps by an axis behind those of its arrays instead of one before them.
 
     A matrix (n, n) of each run becomes (n, n, runs), in memory n² vectors over runs, which processors add and multiply
@@ -22,6 +22,10 @@ def lanes_last(function: Mapped) -> Mapped:
     The function must take and return arrays with any axes behind their own, and compute along them: sums and products
     name their axes from the front, and a number that belongs to a run has the shape of what comes behind; a number that
     all runs share stays one. Derivatives are taken forwards (`jax.jvp`, `jax.jacfwd`), not backwards.
+
+    Args:
+        common: so many of its first arguments come without axes behind their own where all runs share them, as a matrix
+            that multiplies those of all runs at once.
     """
 
     @jax.custom_batching.custom_vmap
@@ -39,7 +43,11 @@ def lanes_last(function: Mapped) -> Mapped:
                 return jnp.moveaxis(leaf, 0, -1)
             return jnp.broadcast_to(leaf[..., None], (*leaf.shape, axis_size)) if jnp.ndim(leaf) else leaf
 
-        moved = jax.tree.map(inwards, arguments, tuple(in_batched))
+        shared = [not any(jax.tree.leaves(batched)) for batched in in_batched[:common]]
+        moved = [
+            argument if k < common and shared[k] else jax.tree.map(inwards, argument, batched)
+            for k, (argument, batched) in enumerate(zip(arguments, in_batched, strict=True))
+        ]
         out = function(*moved)
 
         def outwards(leaf):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -120,23 +121,56 @@ def conditioned(
     return Belief(mean, belief.cov - taken), Innovation(log_likelihood, nis)
 
 
-def mixed(weights: Float[Array, "n_from n_to"], beliefs: Belief) -> Belief:
-    """Moments of the mixtures of Gaussians, one per column of weights that sum to 1; beliefs have a leading axis.
+@partial(lanes_last, common=1)
+def mixed(
+    transition: Float[Array, "n_from n_to ..."],
+    probability: Float[Array, "n_from *lanes"],
+    beliefs: Belief,
+    known: Float[Array, "..."],
+) -> tuple[Float[Array, "n_to *lanes"], Belief]:
+    """The chain's prediction: the probability of each mode, and the moments of the mixture of Gaussians (leading axis)
+    from which it starts.
 
-    Second moments are taken about the average of all means and P + d dᵀ mixed as one matrix product: what is lost is
-    relative to the spread of the means, not to the distance from the origin.
+    Sums over modes of p, p d and p (P + d dᵀ) are products with the matrix of the chain, of all runs at once where they
+    share it. Gaps d are taken from the average of all means: what is lost is relative to the spread of the means, not
+    to the distance from the origin. A mode that cannot be in effect, or so improbable (1e-276) that products with its
+    probability lose digits, keeps its own state.
+
+    Source: Blom and Bar-Shalom 1988; Azimian 2005, table 4.1, whose denominator should be the predicted probability.
+
+    Args:
+        known: see `linalg.once`.
     """
+    probability, beliefs = once((probability, beliefs), known)
+    n_modes, n_lanes = len(probability), probability.ndim - 1
+    center = total(beliefs.mean)[None] / n_modes
+    gaps = once(beliefs.mean - center, known)
+
+    def carried(values):
+        """Sums over the modes before of transition times p times values (mode, *axes, *lanes)."""
+        axes = (1,) * (values.ndim - probability.ndim)
+        weighted = once(probability.reshape(n_modes, *axes, *probability.shape[1:]) * values, known)
+        if transition.ndim == 2 + n_lanes > 2:
+            return total(transition.reshape(n_modes, n_modes, *axes, *transition.shape[2:]) * weighted[:, None])
+        return (transition.T @ weighted.reshape(n_modes, -1)).reshape(values.shape)
+
+    predicted = carried(jnp.ones_like(probability))
+    limits = jnp.finfo(predicted.dtype)
+    possible = predicted > float(limits.tiny) / float(limits.eps) ** 2
+    share = 1.0 / jnp.where(possible, predicted, 1.0)
+    shift = share[:, None] * carried(gaps)
+    second = share[:, None, None] * carried(beliefs.cov + gaps[:, :, None] * gaps[:, None])
+    mean = jnp.where(possible[:, None], center + shift, beliefs.mean)
+    cov = jnp.where(possible[:, None, None], second - shift[:, :, None] * shift[:, None], beliefs.cov)
+    return predicted, Belief(mean, cov)
+
+
+def fused(weights: Float[Array, "n_modes"], beliefs: Belief) -> Belief:
+    """Moments of the mixture of Gaussians (leading axis) with weights of sum 1, about the average of all means."""
     n = beliefs.mean.shape[1]
     center = beliefs.mean.mean(axis=0)
     gaps = beliefs.mean - center[None, :]
     second = beliefs.cov + gaps[:, :, None] * gaps[:, None, :]
-    moments = weights.T @ jnp.concatenate([gaps, second.reshape(-1, n * n)], axis=1)
-    shift = moments[:, :n]
-    cov = moments[:, n:].reshape(-1, n, n) - shift[:, :, None] * shift[:, None, :]
-    return Belief(center[None, :] + shift, 0.5 * (cov + cov.transpose(0, 2, 1)))
-
-
-def fused(weights: Float[Array, "n_modes"], beliefs: Belief) -> Belief:
-    """Moments of one mixture."""
-    both = mixed(weights[:, None], beliefs)
-    return Belief(both.mean[0], both.cov[0])
+    moments = weights @ jnp.concatenate([gaps, second.reshape(-1, n * n)], axis=1)
+    shift, cov = moments[:n], moments[n:].reshape(n, n) - moments[:n, None] * moments[None, :n]
+    return Belief(center + shift, symmetric(cov))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from pydantic import Field
 
 from emt.filters.gaussian import Belief, Innovation, fused, linearly_updated, mixed, propagated
-from emt.filters.mixing import mixing, posterior
+from emt.filters.mixing import posterior
 from emt.filters.state_space import info_of, reading, report
 from emt.lanes import each
 from emt.models.state_space.model import StateSpaceModel
@@ -132,10 +132,11 @@ def multiple_model(model: StateSpaceModel, method: Method, floor: Scalar) -> Fil
         if method == "static":
             floored = jnp.maximum(state.probability, floor)
             probability = floored / floored.sum()
+        elif method == "gpb1":
+            probability = state.probability @ model.transition
+            beliefs = repeated(fused(state.probability, beliefs), n_modes)
         else:
-            probability, weights = mixing(state.probability, model.transition)
-            alike = method == "gpb1"
-            beliefs = repeated(fused(state.probability, beliefs), n_modes) if alike else mixed(weights, beliefs)
+            probability, beliefs = mixed(model.transition, state.probability, beliefs, dt)
         return Bank(probability, bank_predicted(model, beliefs, time, dt), time)
 
     def update(state: Bank, scan: Measurements, key):

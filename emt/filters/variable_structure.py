@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pydantic import Field, PositiveInt, model_validator
 
 from emt.filters.gaussian import Belief, mixed
-from emt.filters.mixing import mixing, posterior
+from emt.filters.mixing import posterior
 from emt.filters.multiple_model import (
     bank_faults,
     bank_predicted,
@@ -139,9 +139,9 @@ def normalised(probability: Float[Array, "n_modes"], active: Mask) -> Float[Arra
 
 def sets_predicted(model: StateSpaceModel, state: Sets, dt: Scalar) -> Sets:
     """Steps 1 and 2 of a cycle: all motions, mixed from those that ran in the step before."""
-    predicted, weights = mixing(state.probability, model.transition)
+    predicted, starts = mixed(model.transition, state.probability, state.beliefs, dt)
     time = state.time + dt
-    beliefs = bank_predicted(model, mixed(weights, state.beliefs), time, dt)
+    beliefs = bank_predicted(model, starts, time, dt)
     probability = normalised(jnp.where(state.active, predicted, 0.0), state.active)
     return Sets(probability, predicted, beliefs, time, state.active)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from emt.config.load import load_experiment
 from emt.config.state_space_model import StateSpaceModelSettings
 from emt.filters.gaussian import Belief, fused, mixed
-from emt.filters.mixing import mixing, posterior
+from emt.filters.mixing import posterior
 from emt.models.state_space.model import StateSpaceModel, state_space_model
 from emt.models.state_space.motions import ConstantTurn, grouped, in_order
 from emt.status import FAILURE
@@ -377,8 +377,10 @@ def test_motions_of_several_kinds_keep_their_places():
 
 # probabilities
 
-mix, bayes = jax.jit(mixing, compiler_options=QUICK), jax.jit(posterior, compiler_options=QUICK)
-N = 5
+mix, bayes = jax.jit(mixed, compiler_options=QUICK), jax.jit(posterior, compiler_options=QUICK)
+N, ONE = 5, jnp.asarray(1.0)
+MEANS = np.random.default_rng(8).normal(size=(N, 3))
+COVS = np.stack([(1.0 + k) * np.eye(3) + 0.3 for k in range(N)])
 SHARE = st.sampled_from([0.0, 0.0, 1e-250, 1e-12, 0.3, 1.0]) | st.floats(1e-250, 1.0)
 SHARES = st.lists(SHARE, min_size=N, max_size=N).filter(lambda shares: sum(shares) > 1e-6)
 LOGS = st.lists(st.floats(-1e4, 1e4), min_size=N, max_size=N)
@@ -389,16 +391,20 @@ def of_sum_one(shares) -> np.ndarray:
 
 
 @given(SHARES, st.lists(SHARES, min_size=N, max_size=N))
-def test_mixing_weights_are_probabilities_of_the_mode_before(probability, rows):
-    """Columns sum to 1, also those of modes that cannot be in effect, which keep their own state."""
+def test_the_chain_mixes_what_it_leads_to(probability, rows):
+    """As mixed one by one with the weights of Bayes' rule; a mode that cannot be in effect keeps its own state."""
     p, pi = of_sum_one(probability), np.array([of_sum_one(row) for row in rows])
-    predicted, weights = map(np.asarray, mix(jnp.asarray(p), jnp.asarray(pi)))
+    predicted, beliefs = mix(jnp.asarray(pi), jnp.asarray(p), Belief(jnp.asarray(MEANS), jnp.asarray(COVS)), ONE)
     np.testing.assert_allclose(predicted, p @ pi, rtol=1e-12, atol=1e-300)
-    assert predicted.sum() == pytest.approx(1.0, abs=1e-12)
-    assert (weights >= 0.0).all()
-    np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=1e-9)
-    for j in np.flatnonzero(predicted == 0.0):
-        np.testing.assert_array_equal(weights[:, j], np.eye(N)[j])
+    for j, total in enumerate(p @ pi):
+        if total > 1e-270:
+            mean, cov = multiple_model.merged(p * pi[:, j] / total, MEANS, COVS)
+        elif total < 1e-280:
+            mean, cov = MEANS[j], COVS[j]
+        else:
+            continue
+        assert_close(beliefs.mean[j], mean, 1e-11)
+        assert_close(beliefs.cov[j], cov, 1e-11)
 
 
 @given(SHARES, LOGS, st.floats(-1e5, 1e5))
@@ -447,13 +453,33 @@ def test_moments_of_mixtures_far_from_the_origin(origin):
     means = origin + 10.0 * rng.normal(size=(6, 4))
     factors = rng.normal(size=(6, 4, 4))
     covs = factors @ factors.transpose(0, 2, 1)
-    weights = rng.gamma(0.5, size=(6, 3))
-    weights = weights / weights.sum(axis=0)
-    both = jax.jit(mixed)(jnp.asarray(weights), Belief(jnp.asarray(means), jnp.asarray(covs)))
-    for i in range(3):
-        mean, cov = multiple_model.merged(weights[:, i], means, covs)
-        np.testing.assert_allclose(both.mean[i], mean, rtol=1e-14)
-        assert_close(both.cov[i], cov, 1e-9)
-        one = fused(jnp.asarray(weights[:, i]), Belief(jnp.asarray(means), jnp.asarray(covs)))
+    transition, probability = rng.dirichlet(np.full(6, 0.5), size=6), rng.dirichlet(np.full(6, 0.5))
+    beliefs = Belief(jnp.asarray(means), jnp.asarray(covs))
+    predicted, found = jax.jit(mixed)(jnp.asarray(transition), jnp.asarray(probability), beliefs, ONE)
+    weights = probability[:, None] * transition / (probability @ transition)
+    for j in range(6):
+        mean, cov = multiple_model.merged(weights[:, j], means, covs)
+        np.testing.assert_allclose(found.mean[j], mean, rtol=1e-14)
+        assert_close(found.cov[j], cov, 1e-9)
+        one = fused(jnp.asarray(weights[:, j]), beliefs)
+        np.testing.assert_allclose(one.mean, mean, rtol=1e-14)
         assert_close(one.cov, cov, 1e-9)
-    np.testing.assert_array_equal(both.cov, np.asarray(both.cov).transpose(0, 2, 1))
+    np.testing.assert_allclose(predicted, probability @ transition, rtol=1e-14)
+    np.testing.assert_array_equal(found.cov, np.asarray(found.cov).transpose(0, 2, 1))
+
+
+@pytest.mark.parametrize("own_chains", [False, True])
+def test_all_runs_are_mixed_at_once(own_chains):
+    """Whether they share the matrix of the chain or have one each; the same as run by run."""
+    rng, runs = np.random.default_rng(6), 7
+    transition = jnp.asarray(rng.dirichlet(np.ones(N), size=(runs, N)) if own_chains else np.full((N, N), 1.0 / N))
+    probability = jnp.asarray(rng.dirichlet(np.ones(N), size=runs))
+    beliefs = Belief(
+        jnp.asarray(MEANS + rng.normal(size=(runs, N, 3))), jnp.asarray(COVS * rng.gamma(2.0, size=(runs, 1, 1, 1)))
+    )
+    axes = (0 if own_chains else None, 0, 0, None)
+    found = jax.jit(jax.vmap(mixed, in_axes=axes))(transition, probability, beliefs, ONE)
+    for run in range(runs):
+        chain = transition[run] if own_chains else transition
+        one = mixed(chain, probability[run], jax.tree.map(lambda leaf, k=run: leaf[k], beliefs), ONE)
+        jax.tree.map(lambda a, b, k=run: np.testing.assert_allclose(a[k], b, rtol=1e-12, atol=1e-13), found, one)

@@ -12,7 +12,7 @@ import numpy as np
 from emt.device import cache_folder
 from emt.sampling.lcd import RESTARTS, parts, standardised, symmetric_set
 
-VERSION = 1
+VERSION = 2
 """Of stored LCD sets; sets of another version are computed anew."""
 Rule = Literal["lcd", "unscented", "cubature"]
 

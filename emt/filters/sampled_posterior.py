@@ -12,12 +12,15 @@ from pydantic import Field
 from emt.filters import kinematics
 from emt.filters import vb_random_matrix as vb
 from emt.filters.base import TrackingModel, innovation_info
-from emt.linalg import Sym2, Vec2, parallel
+from emt.linalg import Sym2, Vec2, once, parallel
 from emt.logarithm import log
 from emt.registry import FILTERS
 from emt.scans import ScanStatistics, scan_statistics
 from emt.settings import PositiveAngleVariance, Settings, ShapeParameter
 from emt.types import Ellipse, Estimate, Filter, Measurements, Prior, Scalar, Traced
+
+HALVINGS = 60
+"""Of the interval in which a median is sought: to 1e-18 of the range of the values, far less than their gaps."""
 
 
 class SampledPosteriorSettings(Settings):
@@ -92,12 +95,12 @@ def draw(state: vb.VbState, stats: ScanStatistics, model: TrackingModel, key, n:
     def weigh(theta, a, b):
         m = jnp.maximum(stats.count, 1.0)
         extent = Sym2.ellipse(jnp.sqrt(a), jnp.sqrt(b), theta)
-        spread = model.extent_scale * extent + model.sensor_noise
+        spread = once(model.extent_scale * extent + model.sensor_noise, model.extent_scale)
         mean_noise = (1.0 / m) * spread
         belief = state.kinematics
         innovation_cov = belief.position_cov + mean_noise
         innovation = stats.mean - belief.position
-        weight = innovation_cov.inverse()
+        weight = once(innovation_cov.inverse(), model.extent_scale)
         log_weight = -0.5 * (
             weight.quadratic(innovation)
             + log(innovation_cov.det())
@@ -112,10 +115,20 @@ def draw(state: vb.VbState, stats: ScanStatistics, model: TrackingModel, key, n:
 
 
 def weighted_median(values: Float[Array, "n"], weights: Float[Array, "n"]) -> Scalar:
-    """The value at which half of the (normalised) weight is reached."""
-    values, weights = jax.lax.sort_key_val(values, weights)
-    reached = jnp.cumsum(weights)
-    return values[jnp.searchsorted(reached, 0.5 * reached[-1])]
+    """The least of the values at which half of the weight is reached.
+
+    By halving an interval around it: sorting a million values takes four times as long.
+    """
+    half = 0.5 * weights.sum()
+
+    def narrower(_, bounds):
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        is_above = jnp.where(values <= middle, weights, 0.0).sum() >= half
+        return jnp.where(is_above, low, middle), jnp.where(is_above, middle, high)
+
+    _, high = jax.lax.fori_loop(0, HALVINGS, narrower, (values.min(), values.max()))
+    return jnp.where(values <= high, values, -jnp.inf).max()
 
 
 def match(state: vb.VbState, samples: Samples) -> SampledState:
@@ -175,7 +188,8 @@ def sampled_posterior(n: int, params: Params, model: TrackingModel) -> Filter:
         spread = model.extent_scale * Sym2.ellipse(axes.x, axes.y, matched.orientation) + model.sensor_noise
         belief = matched.kinematics
         info = innovation_info(belief.position, belief.position_cov, spread, scan)
-        return match(matched, draw(matched, scan_statistics(scan), model, key, n)), info
+        samples = once(draw(matched, scan_statistics(scan), model, key, n), model.extent_scale)
+        return match(matched, samples), info
 
     def estimate(state: SampledState) -> Estimate:
         belief = state.matched.kinematics

@@ -6,6 +6,7 @@ the compiler spreads over vector lanes: four times faster where numbers are many
 
 import math
 from fractions import Fraction
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ WHOLE = 2.0**52
 """Doubles from here on are whole numbers, which their last bits spell out."""
 
 
+@partial(jax.jit, inline=True)
 def log_positive(x):
     """log x of numbers that are positive, finite and not subnormal; of others, some number.
 

@@ -5,12 +5,16 @@ the compiler spreads over vector lanes: five times faster where angles are many 
 """
 
 from fractions import Fraction
+from functools import partial
 from math import factorial, pi, tan
 
 import jax
 import jax.numpy as jnp
 
 from emt.series import economised
+
+traced_once = partial(jax.jit, inline=True)
+"""Traced once for each shape, and then written out where it is used: the program is the same, and made sooner."""
 
 HIGH, MIDDLE, LOW = 1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21
 """A quarter turn in three parts, the first two with trailing zeros: multiples up to 2²⁰ of them are exact."""
@@ -20,6 +24,7 @@ ARC = economised([Fraction((-1) ** k, 2 * k + 1) for k in range(12)], Fraction(t
 """Of arctan(x)/x as a series of x², for slopes up to tan(π/32) to 1e-18."""
 
 
+@traced_once
 def sincos(angle):
     """(sin, cos) of angles up to a million in size; beyond, the last digits fade.
 
@@ -37,6 +42,7 @@ def sincos(angle):
     return _sign(half) * _sine(rest(2.0 * half)), -_sign(past) * _sine(rest(2.0 * past + 1.0))
 
 
+@traced_once
 def sincos_turns(turns):
     """(sin, cos) of angles given in whole turns, which need no reduction."""
     if turns.dtype != jnp.float64:
@@ -74,6 +80,7 @@ def _turning(point, motion):
     return arctan2(y, x), (x * dy - y * dx) / (x * x + y * y)
 
 
+@traced_once
 def _direction(y, x):
     """`arctan2`: the slope is taken against the nearest of five directions π/16 apart, after which seven terms of
     the series are enough."""

@@ -85,7 +85,8 @@ def scan_places(measurement: Measurement, scans: Measurements) -> Float[Array, "
 
 def scan_arrays(program: Program, simulation: Simulation, n: int) -> dict[str, np.ndarray]:
     """Scans, and the truth where there is one, of the first `n` runs of a chunk, with leading axes run and step."""
-    simulation = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[:, :n], RUNS_OF_SIMULATION, 0), simulation)
+    # by NumPy: JAX would compile a program for every shape
+    simulation = jax.tree.map(lambda leaf: np.moveaxis(np.asarray(leaf)[:, :n], RUNS_OF_SIMULATION, 0), simulation)
     arrays = {"scans/points": simulation.scans.points, "scans/mask": simulation.scans.mask}
     measurement = getattr(program.world.scenario, "measurement", None)
     if isinstance(measurement, Measurement):

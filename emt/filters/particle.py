@@ -19,7 +19,7 @@ from emt.filters.resampling import effective_fraction, systematic
 from emt.filters.state_space import info_of, motion_faults, reading, report
 from emt.filters.ukf import PointRule, UnscentedSettings, spread_faults, ukf_kernel
 from emt.filters.unscented import Spread
-from emt.linalg import cholesky, semidefinite_root
+from emt.linalg import cholesky, once, semidefinite_root
 from emt.logarithm import log
 from emt.matrices import Matrix, SquareMatrix, check_square
 from emt.models.state_space.model import StateSpaceModel
@@ -115,7 +115,8 @@ class Params:
 class ParticleState(NamedTuple):
     """Weighted particles and, with Gaussian proposals, what these need."""
 
-    particles: Float[Array, "count n"]
+    particles: Float[Array, "n count"]
+    """Each entry of their states as one vector, which processors take several of at a time."""
     weights: Float[Array, "count"]
     """Of sum 1."""
     time: Scalar
@@ -130,7 +131,7 @@ class Own(NamedTuple):
 
     covs: Float[Array, "count n n"]
     """Covariance that the particle carries."""
-    centers: Float[Array, "count n"]
+    centers: Float[Array, "n count"]
     """Where the particle would have come without noise."""
     predictions: Prediction
     """Before the measurement."""
@@ -153,23 +154,23 @@ def particle(
 
     def init(prior, key) -> ParticleState:
         n, dtype = len(prior.mean), prior.mean.dtype
-        draws = normals(key, (count, n), dtype) @ semidefinite_root(prior.cov).T
-        particles, time = prior.mean[None, :] + draws, jnp.asarray(model.start_time, dtype)
+        draws = semidefinite_root(prior.cov) @ normals(key, (n, count), dtype)
+        particles, time = prior.mean[:, None] + draws, jnp.asarray(model.start_time, dtype)
         weights, floor = jnp.full(count, 1.0 / count, dtype), FLOOR * jnp.diagonal(prior.cov)
         if kernel is None:
             return ParticleState(particles, weights, time, floor, None)
         covs = jnp.broadcast_to(prior.cov, (count, n, n))
-        predictions = jax.vmap(kernel.start)(Belief(particles, covs))
+        predictions = jax.vmap(kernel.start)(Belief(particles.T, covs))
         return ParticleState(particles, weights, time, floor, Own(covs, particles, predictions, jnp.zeros_like(time)))
 
     def predict(state: ParticleState, dt: Scalar, key) -> ParticleState:
         u_key, noise_key = jax.random.split(key)
         poor = effective_fraction(state.weights) < params.resample_below
         u = jax.random.uniform(u_key, dtype=state.weights.dtype)
-        kept = jnp.where(poor, systematic(state.weights, u), jnp.arange(count))
+        kept = once(jnp.where(poor, systematic(state.weights, u, dt), jnp.arange(count, dtype=jnp.int32)), dt)
         weights = jnp.where(poor, 1.0 / count, state.weights)
-        time, particles = state.time + dt, state.particles[kept]
-        centers = jax.vmap(lambda x: motion.move(x, time, dt))(particles)
+        time, particles = state.time + dt, state.particles[:, kept]
+        centers = jax.vmap(lambda x: motion.move(x, time, dt), in_axes=1, out_axes=1)(particles)
         drawn = centers + motion.draws(noise_key, count, dt)
         floor = FLOOR * jnp.diagonal(motion.noise_cov(dt))
         if kernel is None or state.own is None:
@@ -177,43 +178,43 @@ def particle(
         if restart:
             noise_cov = motion.noise_cov(dt) if params.process_noise is None else params.process_noise
             predictions = jax.vmap(kernel.start)(
-                Belief(centers, jnp.broadcast_to(noise_cov, (count, *noise_cov.shape)))
+                Belief(centers.T, jnp.broadcast_to(noise_cov, (count, *noise_cov.shape)))
             )
         else:
-            beliefs = Belief(particles, state.own.covs[kept])
+            beliefs = Belief(particles.T, state.own.covs[kept])
             predictions = jax.vmap(kernel.predict, in_axes=(0, None, None))(beliefs, time, dt)
         return ParticleState(drawn, weights, time, floor, Own(predictions.belief.cov, centers, predictions, dt))
 
-    def log_likelihood(particles: Float[Array, "count n"], value: Float[Array, "m"], time: Scalar):
+    def log_likelihood(particles: Float[Array, "n count"], value: Float[Array, "m"], time: Scalar):
         noise_cov = measurement.noise_cov()
 
         def one(x):
             gap = measurement.difference(value, measurement.observe(x, time))
             return gaussian_log_density(gap, noise_cov)
 
-        found = jax.vmap(one)(particles)
+        found = jax.vmap(one, in_axes=1)(particles)
         return found if params.log_floor is None else jnp.logaddexp(found, params.log_floor)
 
     def expectation(state: ParticleState, value: Float[Array, "m"]) -> Innovation:
         """What the particles expected of the measurement, as a Gaussian."""
         weights = state.weights
-        seen = jax.vmap(lambda x: measurement.observe(x, state.time))(state.particles)
-        about = jax.vmap(lambda z: measurement.difference(z, seen[0]))(seen)
-        shift = weights @ about
-        gaps = about - shift[None, :]
-        cov = (weights[:, None] * gaps).T @ gaps + measurement.noise_cov()
+        seen = jax.vmap(lambda x: measurement.observe(x, state.time), in_axes=1, out_axes=1)(state.particles)
+        about = jax.vmap(lambda z: measurement.difference(z, seen[:, 0]), in_axes=1, out_axes=1)(seen)
+        shift = about @ weights
+        gaps = about - shift[:, None]
+        cov = (weights[None, :] * gaps) @ gaps.T + measurement.noise_cov()
         nothing = Belief(jnp.zeros_like(shift), jnp.zeros_like(cov))
-        return conditioned(nothing, jnp.zeros_like(cov), cov, measurement.difference(value, seen[0] + shift))[1]
+        return conditioned(nothing, jnp.zeros_like(cov), cov, measurement.difference(value, seen[:, 0] + shift))[1]
 
     def proposed(state: ParticleState, own: Own, kernel: Kernel, value: Float[Array, "m"], key):
         """Particles drawn given the measurement, their covariances, and the gains of their log weights."""
         beliefs, _ = jax.vmap(lambda now: kernel.update(now, value, state.time))(own.predictions)
         roots = jax.vmap(cholesky)(beliefs.cov)
         draw = normals(key, state.particles.shape, state.particles.dtype)
-        particles = beliefs.mean + (roots * draw[:, None, :]).sum(axis=2)
+        particles = (beliefs.mean + (roots * draw.T[:, None, :]).sum(axis=2)).T
         scale = log(jnp.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-        log_proposal = -0.5 * (draw * draw + jnp.log(2.0 * jnp.pi)).sum(axis=1) - scale
-        log_motion = jax.vmap(lambda v: motion.log_density(v, own.dt))(particles - own.centers)
+        log_proposal = -0.5 * (draw * draw + jnp.log(2.0 * jnp.pi)).sum(axis=0) - scale
+        log_motion = jax.vmap(lambda v: motion.log_density(v, own.dt), in_axes=1)(particles - own.centers)
         gains = log_likelihood(particles, value, state.time) + log_motion - log_proposal
         # before the first step there is no motion to weigh against: the prior's draws are kept
         moved = own.dt > 0.0
@@ -240,9 +241,9 @@ def particle(
 def moments(state: ParticleState) -> Belief:
     """Mean and covariance of the weighted particles."""
     weights = state.weights
-    mean = weights @ state.particles
-    gaps = state.particles - mean[None, :]
-    return Belief(mean, symmetric((weights[:, None] * gaps).T @ gaps) + jnp.diag(state.floor))
+    mean = state.particles @ weights
+    gaps = state.particles - mean[:, None]
+    return Belief(mean, symmetric((weights[None, :] * gaps) @ gaps.T) + jnp.diag(state.floor))
 
 
 def build(settings: ParticleSettings):

@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from emt.linalg import once
 from emt.types import Scalar
 
 
-def systematic(weights: Float[Array, "n"], u: Scalar) -> Int[Array, "n"]:
+def systematic(weights: Float[Array, "n"], u: Scalar, known: Scalar) -> Int[Array, "n"]:
     """Ancestor of each new particle: the first whose cumulative weight exceeds (i + u) / n.
 
     Counts how many positions lie below each cumulative weight instead of searching for each position: two cumulative
@@ -18,11 +19,12 @@ def systematic(weights: Float[Array, "n"], u: Scalar) -> Int[Array, "n"]:
     Args:
         weights: of sum 1.
         u: uniform on [0, 1).
+        known: see `linalg.once`.
     """
     n = len(weights)
-    below = jnp.clip(jnp.ceil(n * jnp.cumsum(weights) - u), 0, n).astype(int)
+    below = once(jnp.clip(jnp.ceil(n * jnp.cumsum(weights) - u), 0, n).astype(jnp.int32), known)
     # the last particle takes what rounding of the sum leaves
-    return jnp.cumsum(jnp.zeros(n + 1, int).at[below[:-1]].add(1))[:n]
+    return jnp.cumsum(jnp.zeros(n + 1, jnp.int32).at[below[:-1]].add(1))[:n]
 
 
 def effective_fraction(weights: Float[Array, "n"]) -> Scalar:

@@ -257,7 +257,7 @@ def build(settings: StateSpaceScenarioSettings, runs: int):
                 def moved(alike: Alike):
                     def branch(x):
                         one = jax.tree.map(lambda leaf: leaf[place_in[motion]], alike.motion)
-                        return one.move(x, time, params.dt) + one.draws(noise_key, 1, params.dt)[0]
+                        return one.move(x, time, params.dt) + one.draws(noise_key, 1, params.dt)[:, 0]
 
                     return branch
 

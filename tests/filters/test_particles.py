@@ -34,7 +34,7 @@ from tests.reference import kalman, particle, unscented
 
 N = 32
 """Particles, and weights to resample by: a power of two, so that the arithmetic of dyadic weights is exact."""
-resample = jax.jit(systematic, compiler_options=QUICK)
+resample = jax.jit(partial(systematic, known=jnp.asarray(1.0)), compiler_options=QUICK)
 
 
 def dyadic(cuts: list[int]) -> np.ndarray:
@@ -95,14 +95,14 @@ def draws_of(world: World, k: int, shape: tuple[int, int]):
     """(uniform, normals of the motion, normals of the proposal) of a step."""
     predict_key, update_key = jax.random.split(jax.random.fold_in(world.key, k))
     u_key, noise_key = jax.random.split(predict_key)
-    gaussian = [np.asarray(normals(key, shape, jnp.float64)) for key in (noise_key, update_key)]
+    gaussian = [np.asarray(normals(key, shape[::-1], jnp.float64)).T for key in (noise_key, update_key)]
     return float(jax.random.uniform(u_key)), *gaussian
 
 
 def start_of(world: World) -> np.ndarray:
     """Particles drawn from the prior."""
     n = len(world.prior.mean)
-    draws = np.asarray(normals(world.key, (N, n), jnp.float64))
+    draws = np.asarray(normals(world.key, (n, N), jnp.float64)).T
     return np.asarray(world.prior.mean) + draws @ np.linalg.cholesky(np.asarray(world.prior.cov)).T
 
 
@@ -129,7 +129,7 @@ def bootstrap(world: World, fraction: float):
 def assert_particles(answer, results) -> None:
     """Particles, weights, and the estimate from them, step by step."""
     for k, result in enumerate(results):
-        assert_close(answer.state.particles[k], result.particles)
+        assert_close(answer.state.particles[k].T, result.particles)
         assert_close(answer.state.weights[k], np.exp(result.log_weights))
         assert_close(answer.estimate.mean[k], result.mean)
         # the textbook's Σ w x xᵀ - m mᵀ has lost digits to the distance from the origin
@@ -215,7 +215,7 @@ def test_a_first_scan_without_a_prediction_weighs_draws_of_the_prior():
     s, z = textbook(world)[0], np.asarray(world.scans.points[0, 0])
     expected = particle.normalised(np.array([log_likelihood(s, z, x) for x in start_of(world)]))
     answer = tracked({"kind": "particle", "particles": N, "proposal": {"kind": "ekf"}}, world, first=False)
-    assert_close(answer.state.particles[0], start_of(world))
+    assert_close(answer.state.particles[0].T, start_of(world))
     assert_close(answer.state.weights[0], np.exp(expected))
     np.testing.assert_array_equal(answer.state.own.covs[0], np.broadcast_to(world.prior.cov, (N, 4, 4)))
 
@@ -236,7 +236,7 @@ def test_the_growth_series_is_weighed_by_its_gamma_noise():
                 lambda z, x, s=s: log_likelihood(s, z, x), 1.0,
             )  # fmt: skip
             particles, covs, log_weights = result.particles, result.covariances, result.log_weights
-            assert_close(answer.state.particles[k], particles)
+            assert_close(answer.state.particles[k].T, particles)
             assert_close(answer.state.weights[k], np.exp(log_weights))
             none += (log_weights == -np.inf).sum()
     assert none > 0
@@ -324,10 +324,10 @@ def test_a_cloud_of_one_particle_reports_a_positive_covariance():
     """All weight on one particle: a millionth of the deviation of a step is left."""
     rng = np.random.default_rng(0)
     state = ParticleState(
-        jnp.asarray(rng.normal(size=(N, 4))), jnp.asarray(np.eye(N)[5]), jnp.asarray(0.0), jnp.full(4, 1e-12), None
+        jnp.asarray(rng.normal(size=(4, N))), jnp.asarray(np.eye(N)[5]), jnp.asarray(0.0), jnp.full(4, 1e-12), None
     )
     belief = moments(state)
-    np.testing.assert_array_equal(belief.mean, state.particles[5])
+    np.testing.assert_array_equal(belief.mean, state.particles[:, 5])
     np.testing.assert_array_equal(belief.cov, 1e-12 * np.eye(4))
     sharp = one_motion(linear_world().model.motions[0], Position(1e-8 * jnp.eye(2)))
     answer = tracked({"kind": "particle", "particles": N, "resample_below": 0.0}, linear_world()._replace(model=sharp))
@@ -354,7 +354,7 @@ def test_particles_that_restart_do_not_depend_on_what_they_carried():
 def test_gamma_noise_has_the_stated_moments_and_density(shape, rate):
     motion = Growth(jnp.asarray(0.1), jnp.asarray(rate), shape)
     dt, count = jnp.asarray(1.0), 40_000
-    draws = np.asarray(motion.draws(jax.random.key(3), count, dt))
+    draws = np.asarray(motion.draws(jax.random.key(3), count, dt)).T
     assert draws.shape == (count, 1)
     law = stats.gamma(shape, scale=1.0 / rate)
     assert draws.mean() == pytest.approx(shape / rate, abs=4.0 * law.std() / np.sqrt(count))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from emt.draws import normals
 from emt.lanes import total
-from emt.linalg import Vec2, cholesky, forward_solve, semidefinite_root
+from emt.linalg import Vec2, cholesky, forward_solve, once, semidefinite_root
 from emt.models.motion import MotionNoise
 from emt.models.turn import coordinated_turn
 from emt.types import Scalar, Traced
@@ -35,10 +35,11 @@ class Motion:
         """Covariance of the noise over `dt` seconds."""
         raise TypeError(f"{type(self).__name__} does not say its noise")
 
-    def draws(self, key: PRNGKeyArray, count: int, dt: Scalar) -> Float[Array, "count n"]:
+    def draws(self, key: PRNGKeyArray, count: int, dt: Scalar) -> Float[Array, "n count"]:
         """Independent draws of the noise."""
         root = semidefinite_root(self.noise_cov(dt))
-        return normals(key, (count, root.shape[0]), root.dtype) @ root.T
+        draws = normals(key, (root.shape[0], count), root.dtype)
+        return total(root.T[:, :, None] * (once(draws, dt) if count > 1 else draws)[:, None])
 
     def log_density(self, noise: State, dt: Scalar) -> Scalar:
         """Log density of the noise; its covariance must have full rank."""
@@ -155,10 +156,10 @@ class Growth(Motion):
     def noise_cov(self, dt: Scalar) -> Cov:
         return jnp.asarray(self.shape / (self.rate * self.rate)).reshape(1, 1)
 
-    def draws(self, key: PRNGKeyArray, count: int, dt: Scalar) -> Float[Array, "count n"]:
+    def draws(self, key: PRNGKeyArray, count: int, dt: Scalar) -> Float[Array, "n count"]:
         # a gamma of whole shape is a sum of exponentials
         parts = jax.random.exponential(key, (count, self.shape), jnp.asarray(self.rate).dtype)
-        return parts.sum(axis=1, keepdims=True) / self.rate
+        return parts.sum(axis=1)[None] / self.rate
 
     def log_density(self, noise: State, dt: Scalar) -> Scalar:
         v = jnp.where(noise[0] > 0.0, noise[0], 1.0)

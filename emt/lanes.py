@@ -24,8 +24,8 @@ def lanes_last(function: Mapped, *, common: int = 0) -> Mapped:
     all runs share stays one. Derivatives are taken forwards (`jax.jvp`, `jax.jacfwd`), not backwards.
 
     Args:
-        common: so many of its first arguments come without axes behind their own where all runs share them, as a matrix
-            that multiplies those of all runs at once.
+        common: number of leading arguments that get no axis of runs where all runs share them, such as a matrix that
+            multiplies those of all runs at once.
     """
 
     @jax.custom_batching.custom_vmap

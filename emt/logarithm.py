@@ -23,7 +23,7 @@ WHOLE = 2.0**52
 """Doubles from here on are whole numbers, which their last bits spell out."""
 
 
-@partial(jax.jit, inline=True)
+@partial(jax.jit, inline=True)  # traced once for each shape, and then written out
 def log_positive(x):
     """log x of numbers that are positive, finite and not subnormal; of others, some number.
 

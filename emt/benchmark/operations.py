@@ -158,7 +158,7 @@ def shape_mixture(points: float, samples: int) -> float:
 def multiple_model(points: float, motions: int) -> float:
     """Interacting multiple models of a point with four states whose position is measured."""
     r, entries = motions, 4 + 10
-    probabilities = r * dot(r)
+    probabilities = r * (dot(r) + 1)
     mixing = 4 * 2 * r + 4 * r + r * 10 * 2 + r * entries * (1 + dot(r) + 1) + r * (10 * 2 + 4)
     predicted = r * (prediction() + 4)
     gain, mean, cov = 4 * 2 * 3, 2 + 4 * 4, 10 * 4

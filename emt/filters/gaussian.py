@@ -128,13 +128,13 @@ def mixed(
     beliefs: Belief,
     known: Float[Array, "..."],
 ) -> tuple[Float[Array, "n_to *lanes"], Belief]:
-    """The chain's prediction: the probability of each mode, and the moments of the mixture of Gaussians (leading axis)
-    from which it starts.
+    """The chain's prediction of each mode: its probability, and mean and covariance of the mixture that its filter
+    starts from. Beliefs have a leading axis of modes; covariances are symmetric but for rounding.
 
     Sums over modes of p, p d and p (P + d dᵀ) are products with the matrix of the chain, of all runs at once where they
     share it. Gaps d are taken from the average of all means: what is lost is relative to the spread of the means, not
-    to the distance from the origin. A mode that cannot be in effect, or so improbable (1e-276) that products with its
-    probability lose digits, keeps its own state.
+    to the distance from the origin. A mode that cannot be in effect, or so improbable (4.6e-277; 8.3e-25 in single
+    precision) that products with its probability lose digits, keeps its own state.
 
     Source: Blom and Bar-Shalom 1988; Azimian 2005, table 4.1, whose denominator should be the predicted probability.
 
@@ -142,7 +142,7 @@ def mixed(
         known: see `linalg.once`.
     """
     probability, beliefs = once((probability, beliefs), known)
-    n_modes, n_lanes = len(probability), probability.ndim - 1
+    n_modes = len(probability)
     center = total(beliefs.mean)[None] / n_modes
     gaps = once(beliefs.mean - center, known)
 
@@ -150,12 +150,13 @@ def mixed(
         """Sums over the modes before of transition times p times values (mode, *axes, *lanes)."""
         axes = (1,) * (values.ndim - probability.ndim)
         weighted = once(probability.reshape(n_modes, *axes, *probability.shape[1:]) * values, known)
-        if transition.ndim == 2 + n_lanes > 2:
+        if transition.ndim > 2:  # each run has its own chain
             return total(transition.reshape(n_modes, n_modes, *axes, *transition.shape[2:]) * weighted[:, None])
         return (transition.T @ weighted.reshape(n_modes, -1)).reshape(values.shape)
 
     predicted = carried(jnp.ones_like(probability))
     limits = jnp.finfo(predicted.dtype)
+    # below, terms of the sums that are smaller by a rounding error squared would be subnormal
     possible = predicted > float(limits.tiny) / float(limits.eps) ** 2
     share = 1.0 / jnp.where(possible, predicted, 1.0)
     shift = share[:, None] * carried(gaps)

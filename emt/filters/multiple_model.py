@@ -9,8 +9,8 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Float
 from pydantic import Field
 
+from emt.filters.bayes import posterior
 from emt.filters.gaussian import Belief, Innovation, fused, linearly_updated, mixed, propagated
-from emt.filters.mixing import posterior
 from emt.filters.state_space import info_of, reading, report
 from emt.lanes import each
 from emt.models.state_space.model import StateSpaceModel

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from pydantic import Field, PositiveInt
 
 from emt.draws import normals
+from emt.filters.bayes import posterior
 from emt.filters.gaussian import Belief, Innovation, Kernel, Prediction, conditioned, symmetric
 from emt.filters.kalman import kalman_kernel
-from emt.filters.mixing import posterior
 from emt.filters.resampling import effective_fraction, systematic
 from emt.filters.state_space import info_of, motion_faults, reading, report
 from emt.filters.ukf import PointRule, UnscentedSettings, spread_faults, ukf_kernel
@@ -116,7 +116,7 @@ class ParticleState(NamedTuple):
     """Weighted particles and, with Gaussian proposals, what these need."""
 
     particles: Float[Array, "n count"]
-    """Each entry of their states as one vector, which processors take several of at a time."""
+    """One vector for each entry of the state: processors take several particles at a time."""
     weights: Float[Array, "count"]
     """Of sum 1."""
     time: Scalar

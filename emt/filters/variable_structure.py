@@ -15,8 +15,8 @@ from jax.tree_util import register_dataclass
 from jaxtyping import Array, Bool, Float, Int
 from pydantic import Field, PositiveInt, model_validator
 
+from emt.filters.bayes import posterior
 from emt.filters.gaussian import Belief, mixed
-from emt.filters.mixing import posterior
 from emt.filters.multiple_model import (
     bank_faults,
     bank_predicted,

@@ -16,7 +16,8 @@ from scipy.special import expi
 RESTARTS = 8
 OPTIONS = {"gtol": 1e-9, "ftol": 1e-15, "maxiter": 10_000, "maxcor": 30}
 ALIKE = 1e-8
-"""Sets whose distances differ less are one set, turned: the first of them is taken, or rounding would choose."""
+"""Sets whose distances differ less count as equally good, most often one set turned: the first of them is taken, so
+that rounding does not choose."""
 NODES = 40
 """Of the Gauss-Legendre rule on each panel; to double precision."""
 
@@ -74,7 +75,7 @@ def _mixed(squares: np.ndarray, dimension: int) -> tuple[np.ndarray, np.ndarray]
 
 def _among(squares: np.ndarray, dimension: int) -> tuple[np.ndarray, np.ndarray]:
     """The integral of pairs of points at these squared distances, and its derivatives by them, in which the
-    exponentials cancel; of one point with itself, 0."""
+    exponentials cancel; that of a point with itself, which no move changes, is given as 0."""
     b_max = widest(dimension)
     q = squares / (4.0 * b_max**2)
     tail = expi(-np.where(q > 0.0, q, 1.0)) * (q > 0.0)
@@ -88,9 +89,9 @@ def mirrored(half: np.ndarray, count: int) -> np.ndarray:
 
 
 def of_half(half: np.ndarray, count: int) -> tuple[float, np.ndarray]:
-    """The distance of a symmetric set but for what no point changes, and its gradient, from one half of the set.
+    """The distance of a symmetric set less its constant terms, and the gradient by the points of one half.
 
-    The pairs x, x' and x, -x' of one half stand for all.
+    The pairs x, x' and x, -x' of one half, and those of x with the origin if the set holds it, stand for all.
     """
     from scipy.spatial.distance import cdist, pdist, squareform
 

@@ -121,3 +121,17 @@ def test_weighted_median(weights, expected):
     order = [2, 0, 1]
     values, weights = np.array([1.0, 2.0, 3.0])[order], np.array(weights, float)[order]
     assert float(sampled.weighted_median(jnp.asarray(values), jnp.asarray(weights))) == expected
+
+
+def test_weighted_medians_of_many_are_those_of_sorted_values():
+    """Exactly, also with a far value of no weight, which widens the interval that is halved, and around zero."""
+    rng = np.random.default_rng(5)
+    values, weights = rng.normal(size=(6, 501)) ** 3, rng.gamma(0.5, size=(6, 501))
+    values[1, 7], weights[1, 7] = 1e25, 0.0
+    values[2], weights[2, 4] = 5.0 + 1e-9 * values[2], 0.0
+    values[3, :400] = 0.0
+    order = np.argsort(values, axis=1)
+    reached = np.take_along_axis(weights, order, 1).cumsum(axis=1) >= 0.5 * weights.sum(axis=1, keepdims=True)
+    expected = np.take_along_axis(values, order, 1)[np.arange(6), reached.argmax(axis=1)]
+    found = jax.jit(jax.vmap(sampled.weighted_median))(jnp.asarray(values), jnp.asarray(weights))
+    np.testing.assert_array_equal(found, expected)

@@ -76,8 +76,8 @@ def test_sets_are_symmetric_near_and_standard(dimension, count):
     assert dimension == 1 or parts(standard).distance < min(parts(other).distance for other in others)
 
 
-def test_of_turned_sets_the_first_is_taken(monkeypatch):
-    """Not the one that rounding favours: the set is the same on every machine."""
+def test_of_equally_good_sets_the_first_is_taken(monkeypatch):
+    """Not the one that rounding favours."""
     points, turn = symmetric_set(2, 7, restarts=1), np.linalg.qr(np.random.default_rng(3).normal(size=(2, 2)))[0]
 
     def favoured(distance):

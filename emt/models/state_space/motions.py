@@ -36,10 +36,11 @@ class Motion:
         raise TypeError(f"{type(self).__name__} does not say its noise")
 
     def draws(self, key: PRNGKeyArray, count: int, dt: Scalar) -> Float[Array, "n count"]:
-        """Independent draws of the noise."""
+        """Independent draws of the noise, one per column."""
         root = semidefinite_root(self.noise_cov(dt))
         draws = normals(key, (root.shape[0], count), root.dtype)
-        return total(root.T[:, :, None] * (once(draws, dt) if count > 1 else draws)[:, None])
+        draws = once(draws, dt) if count > 1 else draws  # a single draw is cheaper computed anew
+        return total(root.T[:, :, None] * draws[:, None])
 
     def log_density(self, noise: State, dt: Scalar) -> Scalar:
         """Log density of the noise; its covariance must have full rank."""

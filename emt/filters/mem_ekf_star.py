@@ -109,7 +109,7 @@ def update_with_point(state: Now, point: Vec2, real: Bool[Array, ""], model: Tra
     t1, t2 = mt * m1 * w.xx * w.xy, mt * m2 * w.xy * w.yy
     i11, i12, i22 = 0.5 * m1 * m1 * w.xx**2, 0.5 * m1 * m2 * w.xy**2, 0.5 * m2 * m2 * w.yy**2
 
-    pull_t, pull_1, pull_2, tt, t1, t2, i11, i12, i22 = once((pull_t, pull_1, pull_2, tt, t1, t2, i11, i12, i22), k)
+    pull_t, tt, t1, t2, i11, i12, i22 = once((pull_t, tt, t1, t2, i11, i12, i22), k)
     u = state.shape_chol
     # shift = U Uᵀ pull
     h1 = u.a11 * pull_t + u.a21 * pull_1 + u.a31 * pull_2

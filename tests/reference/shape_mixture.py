@@ -91,7 +91,8 @@ def markov(points, x, cov, sigma2, q, samples, transition, second_order):
         joint = mu[:, None] * transition
         if second_order:
             pairs = [[component(*predicted(states[i]), y, sigma2, samples, j) for j in range(n)] for i in range(n)]
-            logs = np.log(joint) + np.array([[p[2] for p in row] for row in pairs])
+            with np.errstate(divide="ignore"):  # a pair may be impossible
+                logs = np.log(joint) + np.array([[p[2] for p in row] for row in pairs])
             states = []
             for j in range(n):
                 weights = normalised(logs[:, j])

@@ -129,7 +129,7 @@ def mixed(
     known: Float[Array, "..."],
 ) -> tuple[Float[Array, "n_to *lanes"], Belief]:
     """The chain's prediction of each mode: its probability, and mean and covariance of the mixture that its filter
-    starts from. Beliefs have a leading axis of modes; covariances are symmetric but for rounding.
+    starts from. Beliefs have a leading axis of modes; covariances are symmetric to the last bit.
 
     Sums over modes of p, p d and p (P + d dᵀ) are products with the matrix of the chain, of all runs at once where they
     share it. Gaps d are taken from the average of all means: what is lost is relative to the spread of the means, not
@@ -156,13 +156,14 @@ def mixed(
 
     predicted = carried(jnp.ones_like(probability))
     limits = jnp.finfo(predicted.dtype)
-    # below, terms of the sums that are smaller by a rounding error squared would be subnormal
+    # with smaller ones, what counts of the sums would be subnormal
     possible = predicted > float(limits.tiny) / float(limits.eps) ** 2
     share = 1.0 / jnp.where(possible, predicted, 1.0)
     shift = share[:, None] * carried(gaps)
     second = share[:, None, None] * carried(beliefs.cov + gaps[:, :, None] * gaps[:, None])
     mean = jnp.where(possible[:, None], center + shift, beliefs.mean)
-    cov = jnp.where(possible[:, None, None], second - shift[:, :, None] * shift[:, None], beliefs.cov)
+    cov = second - shift[:, :, None] * shift[:, None]
+    cov = jnp.where(possible[:, None, None], 0.5 * (cov + cov.swapaxes(1, 2)), beliefs.cov)
     return predicted, Belief(mean, cov)
 
 

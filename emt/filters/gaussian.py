@@ -160,10 +160,10 @@ def mixed(
     possible = predicted > float(limits.tiny) / float(limits.eps) ** 2
     share = 1.0 / jnp.where(possible, predicted, 1.0)
     shift = share[:, None] * carried(gaps)
-    second = share[:, None, None] * carried(beliefs.cov + gaps[:, :, None] * gaps[:, None])
+    second = carried(beliefs.cov + gaps[:, :, None] * gaps[:, None])
+    second = (0.5 * share)[:, None, None] * (second + second.swapaxes(1, 2))
     mean = jnp.where(possible[:, None], center + shift, beliefs.mean)
-    cov = second - shift[:, :, None] * shift[:, None]
-    cov = jnp.where(possible[:, None, None], 0.5 * (cov + cov.swapaxes(1, 2)), beliefs.cov)
+    cov = jnp.where(possible[:, None, None], second - shift[:, :, None] * shift[:, None], beliefs.cov)
     return predicted, Belief(mean, cov)
 
 
